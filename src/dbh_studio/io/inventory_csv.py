@@ -1,0 +1,105 @@
+"""The inventory as CSV: UTF-8, comma, one header line, line feeds, an empty cell for what is not known.
+
+The same inventory gives the same bytes on every machine. Text that a spreadsheet would run as a formula is defused.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+from dbh_studio.core.inventory import COLUMNS, Inventory, InventoryRow
+from dbh_studio.errors import FileError
+from dbh_studio.io.atomic import atomic_file
+
+# Decimals by column: a tape reads millimetres, a scanner no finer than that.
+_DECIMALS = {
+    "dbh_cm": 2,
+    "hom_m": 3,
+    "coverage_deg": 1,
+    "max_gap_deg": 1,
+    "rmse_mm": 1,
+    "lean_deg": 1,
+    "x_m": 3,
+    "y_m": 3,
+    "z_ground_m": 3,
+    "scale_err_pct": 3,
+    "easting": 3,
+    "northing": 3,
+}
+
+# OWASP, "CSV injection": these start a formula in Excel, LibreOffice and Google Sheets.
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\n", "＝", "＋", "－", "＠")
+
+
+def _cell(column: str, value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
+        text = f"{value:.{_DECIMALS[column]}f}"
+        # -0.000 is a zero that looks like a mistake.
+        return text.removeprefix("-") if float(text) == 0 else text
+    # A NUL ends the text for many readers; a lone carriage return is a line end to some and is not quoted by csv.
+    text = str(value).replace("\x00", "").replace("\r\n", "\n").replace("\r", "\n")
+    return f"'{text}" if text.startswith(_FORMULA_STARTS) else text
+
+
+def _cells(row: InventoryRow) -> list[str]:
+    return [_cell(column, getattr(row, column)) for column in COLUMNS]
+
+
+def inventory_csv(inventory: Inventory, *, bom: bool = False) -> bytes:
+    """The whole file.
+
+    Args:
+        bom: Begin with a byte order mark, which old Excel needs to see UTF-8 and R and older pandas take for text.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(_cells(row) for row in inventory)
+    return text.getvalue().encode("utf-8-sig" if bom else "utf-8", errors="replace")
+
+
+def write_inventory_csv(path: Path | str, inventory: Inventory, *, bom: bool = False) -> Path:
+    """Write the inventory; `path` is replaced whole or stays as it was.
+
+    Raises:
+        FileError: The file cannot be written (disk full, open in a spreadsheet, not permitted).
+    """
+    path = Path(path)
+    content = inventory_csv(inventory, bom=bom)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as file:
+            file.write(content)
+    except OSError as error:
+        raise FileError(
+            path,
+            f"The table could not be written ({error.strerror or error}).",
+            "Close it where it is open, make room on the disk, or choose another folder.",
+        ) from error
+    return path
+
+
+def projected_epsg(crs: str | None) -> tuple[bool, int | None]:
+    """Whether `crs` is a projected (map) system, and the EPSG code of its horizontal part where it has one.
+
+    A system that cannot be understood is (False, None): no position is better than a wrong one.
+    """
+    if not crs:
+        return False, None
+    import pyproj  # slow to import, and needed only for clouds with a coordinate reference system
+
+    try:
+        parsed = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError:
+        return False, None
+    horizontal = parsed.sub_crs_list[0] if parsed.is_compound and parsed.sub_crs_list else parsed
+    return bool(horizontal.is_projected), horizontal.to_epsg()

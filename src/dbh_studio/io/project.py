@@ -1,0 +1,383 @@
+"""The saved plot: a folder ``NAME.dbh`` that is at any instant, crash or not, one whole state.
+
+    project.json    everything but the points of the trunks; the one file that counts
+    trunks-7.npz    the trunks project.json speaks of; an older or newer one is what a crash left, and is removed
+    history.jsonl   what was done, by whom and when; for the record, never read by the program
+    lock            held by the process that writes the plot
+    cache/          may be deleted at any time
+
+Each save writes a new trunks file (where trunks changed), then project.json in one step, then removes the old trunks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from dbh_studio.core.inventory import TreeRecord
+from dbh_studio.core.scale import ScaleEstimate, ScaleSource
+from dbh_studio.core.trunks import Trunk, TrunkSet
+from dbh_studio.errors import ProjectError, ProjectVersionError
+from dbh_studio.io.atomic import atomic_file
+from dbh_studio.io.lock import lock_file
+from dbh_studio.settings import Settings
+
+SCHEMA_VERSION = 1
+FOLDER_SUFFIX = ".dbh"
+PROJECT_FILE = "project.json"
+HISTORY_FILE = "history.jsonl"
+LOCK_FILE = "lock"
+
+_TRUNKS_FILE = re.compile(r"trunks-(\d+)\.npz")
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class SavedSource(_Model):
+    """Where the cloud is; `relative_path` is from the saved plot, so that both may be moved together."""
+
+    path: str
+    relative_path: str | None
+    used: tuple[str, ...]
+    n_points: int = Field(ge=0)
+    fingerprint: str
+
+
+class SavedScale(_Model):
+    """A `ScaleEstimate`."""
+
+    metres_per_unit: float = Field(gt=0)
+    source: ScaleSource
+    standard_error: float | None = Field(ge=0)
+
+
+class SavedTree(_Model):
+    """A `TreeRecord`."""
+
+    species: str = ""
+    status: Literal["live", "dead", ""] = ""
+    note: str = ""
+    tag: str = ""
+    edited: bool = False
+    tree_id: int | None = Field(None, gt=0)
+
+
+class SavedProject(_Model):
+    """project.json, schema version 1."""
+
+    schema_version: Literal[1] = 1
+    plot_id: str
+    source: SavedSource
+    up_direction: tuple[float, float, float]
+    scale: SavedScale
+    settings: Settings
+    trunks_file: str = Field(pattern=f"^{_TRUNKS_FILE.pattern}$")
+    next_id: int = Field(ge=1)
+    trees: dict[int, SavedTree]
+
+    @field_validator("up_direction")
+    @classmethod
+    def _is_unit(cls, up: tuple[float, float, float]) -> tuple[float, float, float]:
+        if abs(sum(part * part for part in up) - 1) > 1e-6:
+            raise ValueError("is not of length 1")
+        return up
+
+
+@dataclass(frozen=True, eq=False)
+class PlotState:
+    """What a saved plot holds, in the program's own types. `source_path` is absolute."""
+
+    plot_id: str
+    source_path: Path
+    source_used: tuple[Path, ...]
+    n_points: int
+    fingerprint: str
+    up_direction: tuple[float, float, float]
+    scale: ScaleEstimate
+    settings: Settings
+    trunks: TrunkSet
+    trees: Mapping[int, TreeRecord]
+
+
+def is_project(path: Path | str) -> bool:
+    """Whether `path` is a saved plot, or looks like one that has lost its project.json."""
+    path = Path(path)
+    return path.is_dir() and (path.suffix == FOLDER_SUFFIX or (path / PROJECT_FILE).exists())
+
+
+# ---- reading
+
+
+def read_project(folder: Path | str) -> PlotState:
+    """Read a saved plot. Nothing is written, whatever is found.
+
+    Raises:
+        ProjectVersionError: It was saved by a newer program.
+        ProjectError: A file is missing or damaged; says which.
+    """
+    folder = Path(folder).absolute()
+    saved = _parse(folder / PROJECT_FILE)
+    trunks = _read_trunks(folder / saved.trunks_file, saved)
+    strangers = sorted(set(saved.trees) - set(trunks.ids))
+    if strangers:
+        raise _damaged(folder / PROJECT_FILE, f"it describes trees {strangers} that have no trunk")
+    return PlotState(
+        plot_id=saved.plot_id,
+        source_path=_locate(folder, saved.source),
+        source_used=tuple(Path(path) for path in saved.source.used),
+        n_points=saved.source.n_points,
+        fingerprint=saved.source.fingerprint,
+        up_direction=saved.up_direction,
+        scale=ScaleEstimate(saved.scale.metres_per_unit, saved.scale.source, saved.scale.standard_error),
+        settings=saved.settings,
+        trunks=trunks,
+        trees={i: TreeRecord(**tree.model_dump()) for i, tree in saved.trees.items()},
+    )
+
+
+def _parse(path: Path) -> SavedProject:
+    try:
+        content = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise ProjectError(f"{path.parent.name} is not a saved plot: it has no {PROJECT_FILE}.") from None
+    except OSError as error:
+        raise ProjectError(f"{path} could not be read ({error.strerror or error}).") from error
+    except (ValueError, RecursionError) as error:
+        raise _damaged(path, f"it is not JSON: {error}") from None
+    version = content.get("schema_version") if isinstance(content, dict) else None
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise _damaged(path, "it has no schema_version")
+    if version > SCHEMA_VERSION:
+        raise ProjectVersionError(
+            f"{path.parent.name} was saved by a newer DBH Studio (schema {version}; this one reads {SCHEMA_VERSION}).",
+            "Update DBH Studio to open it.",
+        )
+    try:
+        return SavedProject.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise _damaged(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def _damaged(path: Path, problem: str) -> ProjectError:
+    return ProjectError(
+        f"{path.name} in {path.parent.name} is damaged ({problem}).",
+        "Nothing was changed. Restore the folder from a backup, or open the cloud itself to begin anew.",
+    )
+
+
+def _locate(folder: Path, source: SavedSource) -> Path:
+    """The source beside the plot if it is there, else where it was."""
+    if source.relative_path is not None:
+        beside = Path(os.path.normpath(folder / source.relative_path))
+        if beside.exists():
+            return beside
+    return Path(source.path)
+
+
+def _read_trunks(path: Path, saved: SavedProject) -> TrunkSet:
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            ids, ends, points, origins = (archive[name] for name in ("ids", "ends", "points", "origins"))
+        _check_trunk_arrays(ids, ends, points, origins, saved.source.n_points)
+        parts = np.split(points, ends)[:-1]
+        trunks = tuple(Trunk(int(i), part, str(origin)) for i, part, origin in zip(ids, parts, origins, strict=True))
+        return TrunkSet(trunks, saved.next_id)
+    except FileNotFoundError:
+        raise _damaged(path, "it is missing") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise _damaged(path, str(error)) from error
+
+
+def _check_trunk_arrays(ids: Any, ends: Any, points: Any, origins: Any, n_points: int) -> None:
+    """Raise ValueError unless the arrays are what `_write_trunks` writes, and the trunks are disjoint."""
+    is_integer = all(array.ndim == 1 and array.dtype.kind in "iu" for array in (ids, ends, points))
+    if not is_integer or origins.ndim != 1 or origins.dtype.kind != "U":
+        raise ValueError("its arrays are of the wrong kind")
+    if not len(ids) == len(ends) == len(origins):
+        raise ValueError("its arrays are of different lengths")
+    if (np.diff(ends, prepend=0) <= 0).any() or (ends[-1] if len(ends) else 0) != len(points):
+        raise ValueError("its trunks do not add up to its points")
+    if len(points) and not 0 <= points.min() <= points.max() < n_points:
+        raise ValueError("it speaks of points the cloud does not have")
+    is_taken = np.zeros(n_points, bool)
+    is_taken[points] = True
+    if np.count_nonzero(is_taken) != len(points):
+        raise ValueError("two of its trunks share points")
+
+
+# ---- writing
+
+
+class ProjectWriter:
+    """The right to write one saved plot, from the moment it is made until it is closed.
+
+    Args:
+        folder: The plot's folder; made where it does not exist.
+
+    Raises:
+        ProjectLockedError: Another process writes it, or this one already does.
+        ProjectError: The folder cannot be made or locked.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = Path(folder).absolute()
+        self._saved: tuple[TrunkSet, str] | None = None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock: IO[str] | None = lock_file(self.folder / LOCK_FILE)
+        except OSError as error:
+            raise ProjectError(
+                f"The folder {self.folder} cannot be written ({error.strerror or error}).", "Choose another folder."
+            ) from error
+        self._next_number = 1 + max((number for number, _ in self._trunk_files()), default=0)
+
+    def adopt(self, state: PlotState) -> None:
+        """Say that `state` was just read from the folder, so that its trunks need not be written again."""
+        saved = _parse(self.folder / PROJECT_FILE)
+        self._saved = state.trunks, saved.trunks_file
+
+    def save(self, state: PlotState, *, next_id: int = 1) -> None:
+        """Make the folder hold `state`. Whatever goes wrong, it then holds either that or what it held before.
+
+        Args:
+            next_id: Lower bound of the next id, where ids were given out that no trunk has any more.
+
+        Raises:
+            ProjectError: It cannot be written (disk full, …).
+            ValueError: The writer is closed.
+        """
+        if self._lock is None:
+            raise ValueError("the writer is closed")
+        try:
+            trunks_file = self._save_trunks(state.trunks)
+            content = _saved_project(state, self.folder, trunks_file, next_id).model_dump_json(indent=1).encode()
+            with atomic_file(self.folder / PROJECT_FILE) as file:
+                file.write(content)
+            _sync_folder(self.folder)
+        except OSError as error:
+            raise ProjectError(
+                f"The plot could not be saved in {self.folder} ({error.strerror or error}).",
+                "What was saved before is intact. Make room on the disk; the next change saves everything.",
+            ) from error
+        self._saved = state.trunks, trunks_file
+        self._remove_leftovers(trunks_file)
+
+    def log(self, entries: Iterable[Mapping[str, str]]) -> None:
+        """Append to the history.
+
+        Raises:
+            ProjectError: It cannot be written.
+        """
+        text = "".join(json.dumps(dict(entry), ensure_ascii=False) + "\n" for entry in entries)
+        if not text:
+            return
+        try:
+            with (self.folder / HISTORY_FILE).open("a+b") as file:
+                _append_whole(file, text.encode("utf-8", errors="replace"))
+        except OSError as error:
+            raise ProjectError(f"The history of the plot could not be written ({error.strerror or error}).") from error
+
+    def close(self) -> None:
+        """Give the plot free for others. The lock file stays: removing it would race with the next writer."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _trunk_files(self) -> Sequence[tuple[int, Path]]:
+        found = [(_TRUNKS_FILE.fullmatch(path.name), path) for path in self.folder.iterdir()]
+        return [(int(match.group(1)), path) for match, path in found if match]
+
+    def _save_trunks(self, trunks: TrunkSet) -> str:
+        """The name of a file that holds `trunks`, written unless the last save wrote them."""
+        if self._saved is not None and self._saved[0].trunks == trunks.trunks:
+            return self._saved[1]
+        name = f"trunks-{self._next_number}.npz"
+        self._next_number += 1
+        with atomic_file(self.folder / name) as file:
+            _write_trunks(file, trunks)
+        # Durable before project.json can name it.
+        _sync_folder(self.folder)
+        return name
+
+    def _remove_leftovers(self, trunks_file: str) -> None:
+        """Remove what project.json does not name: it is written, so nothing else is needed any more."""
+        old = [path for _, path in self._trunk_files() if path.name != trunks_file]
+        for path in [*old, *self.folder.glob(".*.part")]:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable. Windows has no such call and needs none."""
+    if os.name == "nt":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _append_whole(file: IO[bytes], content: bytes) -> None:
+    """Append lines, after closing a line that a full disk or a crash cut off."""
+    end = file.seek(0, os.SEEK_END)
+    if end:
+        file.seek(end - 1)
+        if file.read(1) != b"\n":
+            content = b"\n" + content
+    file.write(content)
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _write_trunks(file: IO[bytes], trunks: TrunkSet) -> None:
+    points = [trunk.points for trunk in trunks]
+    np.savez(
+        file,
+        ids=np.array(trunks.ids, np.int32),
+        ends=np.cumsum([len(part) for part in points], dtype=np.int64),
+        points=np.concatenate([np.empty(0, np.int32), *points]),
+        origins=np.array([trunk.origin for trunk in trunks], np.str_),
+    )
+
+
+def _saved_project(state: PlotState, folder: Path, trunks_file: str, next_id: int) -> SavedProject:
+    scale = state.scale
+    return SavedProject(
+        plot_id=state.plot_id,
+        source=SavedSource(
+            path=str(state.source_path),
+            relative_path=_relative(state.source_path, folder),
+            used=tuple(str(path) for path in state.source_used),
+            n_points=state.n_points,
+            fingerprint=state.fingerprint,
+        ),
+        up_direction=state.up_direction,
+        scale=SavedScale(
+            metres_per_unit=scale.metres_per_unit, source=scale.source, standard_error=scale.standard_error
+        ),
+        settings=state.settings,
+        trunks_file=trunks_file,
+        next_id=max(state.trunks.next_id, next_id),
+        trees={i: SavedTree(**asdict(record)) for i, record in sorted(state.trees.items())},
+    )
+
+
+def _relative(path: Path, folder: Path) -> str | None:
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # another drive, on Windows
+        return None

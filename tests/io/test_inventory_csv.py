@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import csv
+import io
+import os
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbh_studio.core.inventory import COLUMNS, Inventory, InventoryRow
+from dbh_studio.errors import FileError
+from dbh_studio.io.inventory_csv import inventory_csv, projected_epsg, write_inventory_csv
+
+MEASURED = InventoryRow(
+    plot_id="Stand 4",
+    tree_id=1,
+    stem_id=1,
+    tag="A-7",
+    status="live",
+    species="Fagus sylvatica",
+    dbh_cm=31.41593,
+    dbh_method="fourier",
+    dbh_definition="curve",
+    hom_m=1.37,
+    coverage_deg=300.04,
+    max_gap_deg=59.96,
+    rmse_mm=4.25,
+    n_points=812,
+    lean_deg=3.14,
+    quality="good",
+    reason="",
+    remedy="",
+    edited=False,
+    x_m=1.5,
+    y_m=-2.25,
+    z_ground_m=-0.0001,
+    scale_source="marker",
+    scale_err_pct=0.15,
+    note='low fork, "twin"',
+    easting=500001.5,
+    northing=4499997.75,
+    epsg=32633,
+)
+REFUSED = replace(
+    MEASURED,
+    tree_id=2,
+    stem_id=2,
+    tag="=HYPERLINK(1)",
+    status="",
+    species="Weißtanne",
+    dbh_cm=None,
+    dbh_method="",
+    dbh_definition="",
+    hom_m=None,
+    coverage_deg=None,
+    max_gap_deg=None,
+    rmse_mm=None,
+    n_points=4,
+    lean_deg=None,
+    quality="refused",
+    reason="Only 4 points at 1.3 m.",
+    remedy="Walk closer.",
+    edited=True,
+    x_m=None,
+    y_m=None,
+    z_ground_m=None,
+    scale_err_pct=None,
+    note="",
+    easting=None,
+    northing=None,
+    epsg=None,
+)
+
+GOLDEN = (
+    "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_method,dbh_definition,hom_m,coverage_deg,max_gap_deg,rmse_mm,"
+    "n_points,lean_deg,quality,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,note,easting,northing,"
+    "epsg\n"
+    "Stand 4,1,1,A-7,live,Fagus sylvatica,31.42,fourier,curve,1.370,300.0,60.0,4.2,812,3.1,good,,,false,1.500,-2.250,"
+    '0.000,marker,0.150,"low fork, ""twin""",500001.500,4499997.750,32633\n'
+    "Stand 4,2,2,'=HYPERLINK(1),,Weißtanne,,,,,,,,4,,refused,Only 4 points at 1.3 m.,Walk closer.,true,,,,marker,,,,,\n"
+).encode()
+
+
+def test_the_bytes_are_golden():
+    assert inventory_csv(Inventory.of([REFUSED, MEASURED])) == GOLDEN
+    assert inventory_csv(Inventory.of([REFUSED, MEASURED]), bom=True) == b"\xef\xbb\xbf" + GOLDEN
+
+
+def test_an_empty_inventory_is_a_header():
+    assert inventory_csv(Inventory()) == GOLDEN.split(b"\n")[0] + b"\n"
+
+
+@given(st.text(max_size=30))
+def test_any_text_comes_back_and_never_starts_a_formula(text):
+    row = replace(MEASURED, note=text, species=text)
+    rows = list(csv.reader(io.StringIO(inventory_csv(Inventory((row,))).decode(), newline=""), strict=True))
+    assert len(rows) == 2 and len(rows[1]) == len(COLUMNS)
+    cell = rows[1][COLUMNS.index("note")]
+    assert not cell.startswith(("=", "+", "-", "@", "\t", "\r", "\n"))
+    encodable = text.encode(errors="replace").decode().replace("\0", "").replace("\r\n", "\n").replace("\r", "\n")
+    assert cell in (encodable, "'" + encodable)
+
+
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r"])
+def test_formulas_are_defused_and_negative_numbers_are_not(start):
+    row = replace(MEASURED, note=start + "1+1", x_m=-3.0)
+    cells = next(csv.DictReader(io.StringIO(inventory_csv(Inventory((row,))).decode(), newline="")))
+    assert cells["note"] == "'" + start.replace("\r", "\n") + "1+1"
+    assert cells["x_m"] == "-3.000"
+
+
+def test_writing_makes_the_folder_and_replaces_the_file_whole(tmp_path):
+    path = tmp_path / "out" / "plot.csv"
+    assert write_inventory_csv(path, Inventory((MEASURED, REFUSED))) == path
+    assert path.read_bytes() == GOLDEN
+    write_inventory_csv(path, Inventory())
+    assert path.read_bytes().count(b"\n") == 1
+    assert [child.name for child in path.parent.iterdir()] == ["plot.csv"]
+
+
+def test_a_full_disk_leaves_the_old_table(tmp_path, monkeypatch):
+    path = tmp_path / "plot.csv"
+    write_inventory_csv(path, Inventory((MEASURED, REFUSED)))
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(FileError, match="No space left") as caught:
+        write_inventory_csv(path, Inventory())
+    assert caught.value.path == path and caught.value.remedy
+    assert path.read_bytes() == GOLDEN
+    assert [child.name for child in tmp_path.iterdir()] == ["plot.csv"]
+
+
+def test_which_reference_systems_are_maps():
+    pyproj = pytest.importorskip("pyproj")
+    assert projected_epsg("EPSG:32633") == (True, 32633)
+    assert projected_epsg(pyproj.CRS.from_epsg(25832).to_wkt()) == (True, 25832)
+    assert projected_epsg("EPSG:25832+7837") == (True, 25832)
+    assert projected_epsg("EPSG:4326") == (False, 4326)
+    for unknown in (None, "", "here and there", "EPSG:999999"):
+        assert projected_epsg(unknown) == (False, None)
