@@ -1,0 +1,208 @@
+"""Keeps a Session's saved plot up to date: every command is saved, and the person is told when one could not be."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import getpass
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Literal
+
+from dbh_studio.app.document import Document, SourceInfo
+from dbh_studio.app.session import Change, Session
+from dbh_studio.errors import ProjectError
+from dbh_studio.io.project import PlotState, ProjectWriter
+
+_log = logging.getLogger(__name__)
+
+
+def state_from_document(document: Document) -> PlotState:
+    """What is saved of a Document: all of it."""
+    source = document.source
+    return PlotState(
+        plot_id=document.plot_id,
+        source_path=source.path,
+        source_used=source.used,
+        n_points=source.n_points,
+        fingerprint=source.fingerprint,
+        up_direction=document.up_direction,
+        scale=document.scale,
+        settings=document.settings,
+        trunks=document.trunks,
+        trees=document.trees,
+    )
+
+
+def document_from_state(state: PlotState, source: SourceInfo) -> Document:
+    """The Document that was saved, about `source`, which the caller has found to be the same cloud."""
+    return Document(state.plot_id, source, state.up_direction, state.scale, state.settings, state.trunks, state.trees)
+
+
+@dataclass(frozen=True)
+class SaveStatus:
+    """Whether the plot on disk is the plot on the screen.
+
+    Attributes:
+        state: ``saved``, ``saving`` or ``not_saved``.
+        problem: Why it is not saved, and what to do; else empty.
+    """
+
+    state: Literal["saved", "saving", "not_saved"]
+    problem: str = ""
+
+
+class Autosave:
+    """Saves after each command, on a thread of its own so that an edit does not wait for the disk.
+
+    Commands that come while a save runs are saved together. A save that fails leaves the earlier one intact, is
+    reported, and is tried again with the next command and at the end.
+
+    Args:
+        session: The plot; its `saver` becomes this.
+        writer: The right to write its folder; closed with this.
+        background: Save on a thread; otherwise before the command returns.
+        author: Whom the history names; the system's user by default.
+        is_new: Save the state at hand, too.
+        label: What the history says of that.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        writer: ProjectWriter,
+        *,
+        background: bool = True,
+        author: str | None = None,
+        is_new: bool = True,
+        label: str = "Create the plot",
+    ) -> None:
+        self._session = session
+        self._writer = writer
+        self._author = _user() if author is None else author
+        self._condition = threading.Condition()
+        self._saving = threading.Lock()
+        self._entries: list[dict[str, str]] = []
+        self._is_due = self._has_news = self._is_closing = False
+        self._status = SaveStatus("saved")
+        self._listeners: list[Callable[[SaveStatus], None]] = []
+        self._thread: threading.Thread | None = None
+        if is_new:
+            self._entries.append(self._entry(label))
+            self._is_due = True
+            self._save_due()
+        self._unsubscribe = session.subscribe(self._on_change)
+        session.saver = self
+        atexit.register(self.close)
+        if background:
+            self._thread = threading.Thread(target=self._run, name="autosave", daemon=True)
+            self._thread.start()
+
+    @property
+    def folder(self) -> Path:
+        """The saved plot."""
+        return self._writer.folder
+
+    @property
+    def status(self) -> SaveStatus:
+        """Whether everything is saved."""
+        return self._status
+
+    def subscribe(self, listener: Callable[[SaveStatus], None]) -> Callable[[], None]:
+        """Call `listener`, on the saving thread, whenever the status changes; returns the function that ends it."""
+        self._listeners.append(listener)
+
+        def unsubscribe() -> None:
+            with contextlib.suppress(ValueError):
+                self._listeners.remove(listener)
+
+        return unsubscribe
+
+    def flush(self) -> bool:
+        """Save what is not saved, now; whether everything is."""
+        self._save_due()
+        return self._status.state == "saved"
+
+    def close(self) -> None:
+        """Save what is left and release the folder. Also done when the program ends."""
+        atexit.unregister(self.close)
+        if self._is_closing:
+            return
+        self._unsubscribe()
+        with self._condition:
+            self._is_closing = True
+            self._condition.notify()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._save_due()
+        self._writer.close()
+
+    def _on_change(self, change: Change) -> None:
+        with self._condition:
+            self._entries.append(self._entry(change.label))
+            self._is_due = self._has_news = True
+            self._condition.notify()
+        if self._thread is None:
+            self._save_due()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                # News, not what is due: a save that failed stays due, and waits for the next command.
+                self._condition.wait_for(lambda: self._is_closing or self._has_news)
+                if self._is_closing:
+                    return
+                self._has_news = False
+            self._save_due()
+
+    def _save_due(self) -> None:
+        """Save the Document as it is now, if the one on disk is another."""
+        with self._saving:
+            with self._condition:
+                if not self._is_due:
+                    return
+                entries, self._entries = self._entries, []
+                self._is_due = False
+                document, next_id = self._session.document, self._session.next_id
+            self._set_status(SaveStatus("saving"))
+            try:
+                self._writer.save(state_from_document(document), next_id=next_id)
+                self._writer.log(entries)
+            except ProjectError as error:
+                self._keep_due(entries, str(error))
+            except Exception as error:  # noqa: BLE001 - the session must live on, and the person must hear of it
+                _log.exception("Saving failed")
+                self._keep_due(entries, f"The plot could not be saved ({error}).")
+            else:
+                self._set_status(SaveStatus("saved"))
+
+    def _keep_due(self, entries: list[dict[str, str]], problem: str) -> None:
+        with self._condition:
+            self._entries = entries + self._entries
+            self._is_due = True
+        self._set_status(SaveStatus("not_saved", problem))
+
+    def _set_status(self, status: SaveStatus) -> None:
+        if status == self._status:
+            return
+        self._status = status
+        for listener in tuple(self._listeners):
+            try:
+                listener(status)
+            except Exception:  # noqa: BLE001 - the others must hear of it
+                _log.exception("A listener of the save status failed")
+
+    def _entry(self, label: str) -> dict[str, str]:
+        return {"when": datetime.now(timezone.utc).isoformat(timespec="seconds"), "who": self._author, "what": label}
+
+
+def _user() -> str:
+    # Which of these it raises where there is no such user depends on the version of Python.
+    with contextlib.suppress(OSError, KeyError, ImportError):
+        return getpass.getuser()
+    return ""

@@ -1,0 +1,199 @@
+"""Every edit of a plot, as a function `Document -> Document` with a label for the Undo button.
+
+A command that cannot be applied raises `CommandError` and changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dbh_studio.app.document import Direction, Document, unit_direction
+from dbh_studio.core.inventory import TreeRecord
+from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.trunks import Trunk, TrunkSet
+from dbh_studio.errors import CommandError, SettingError
+
+# A detection that shares more than this part of its points with an old trunk is that trunk, found again. Above one half
+# at most one old trunk can qualify.
+_SAME_TRUNK_IOU = 0.5
+
+
+@dataclass(frozen=True)
+class Command:
+    """An edit.
+
+    Attributes:
+        label: What it does, for the Undo button and the history: ``Delete trunk 5``.
+        apply: Pure; returns the same object where there is nothing to change, raises `CommandError` where it cannot.
+    """
+
+    label: str
+    apply: Callable[[Document], Document]
+
+
+def rename_plot(plot_id: str) -> Command:
+    """Call the plot something else."""
+    name = plot_id.strip()
+
+    def apply(document: Document) -> Document:
+        if not name:
+            raise CommandError("A plot needs a name.", "Type at least one letter or digit.")
+        return document if name == document.plot_id else replace(document, plot_id=name)
+
+    return Command(f"Rename the plot to {name}", apply)
+
+
+def set_scale(scale: ScaleEstimate) -> Command:
+    """Say how long a source unit is. Trunks stay: they are indices."""
+
+    def apply(document: Document) -> Document:
+        return document if scale == document.scale else replace(document, scale=scale)
+
+    label = "Forget the scale" if not scale.is_known else f"Set the scale to {scale.metres_per_unit:.6g} m per unit"
+    return Command(label, apply)
+
+
+def set_up(direction: str | Direction | NDArray[Any]) -> Command:
+    """Say where the sky is: a named axis of the source or any direction in it."""
+
+    def apply(document: Document) -> Document:
+        try:
+            up = unit_direction(direction)
+        except ValueError as error:
+            raise CommandError(f"The up direction was not understood: {error}.") from None
+        return document if up == document.up_direction else replace(document, up_direction=up)
+
+    return Command("Change the up direction", apply)
+
+
+def change_settings(section: str, **values: Any) -> Command:
+    """Change fields of one section of the settings: ``ground``, ``trunks`` or ``measure``."""
+
+    def apply(document: Document) -> Document:
+        if section not in type(document.settings).model_fields:
+            raise CommandError(f"There are no settings called {section!r}.")
+        before = getattr(document.settings, section)
+        try:
+            after = before.changed(**values)
+        except SettingError as error:
+            raise CommandError(error.problem, error.remedy) from error
+        if after == before:
+            return document
+        return replace(document, settings=document.settings.model_copy(update={section: after}))
+
+    return Command(f"Change the {section} settings", apply)
+
+
+def replace_trunks(trunks: TrunkSet, *, label: str = "") -> Command:
+    """Put newly found trunks in place of all there are.
+
+    A new trunk that is an old one found again keeps its id and what was said about it; the others get new ids. In a
+    plot that never had a trunk the given ids are kept, so that a file's own tree numbers stay.
+    """
+
+    def apply(document: Document) -> Document:
+        _check_indices(trunks, document.source.n_points)
+        numbered = trunks if document.trunks.next_id == 1 else _renumbered(trunks, document)
+        # A record speaks of the stem; that its points were set by hand is no longer so.
+        trees = {i: replace(record, edited=False) for i, record in document.trees.items() if i in numbered}
+        return replace(document, trunks=numbered, trees=trees)
+
+    return Command(label or f"Find {len(trunks)} trunks", apply)
+
+
+def delete_trunk(trunk_id: int) -> Command:
+    """Take one trunk away. Its id is not given out again."""
+
+    def apply(document: Document) -> Document:
+        _existing(document, trunk_id)
+        trees = {i: record for i, record in document.trees.items() if i != trunk_id}
+        return replace(document, trunks=document.trunks.without(trunk_id), trees=trees)
+
+    return Command(f"Delete trunk {trunk_id}", apply)
+
+
+def restore_trunk(earlier: Document, trunk_id: int) -> Command:
+    """Bring one trunk back as it was in an earlier Document, with what was said about it."""
+
+    def apply(document: Document) -> Document:
+        trunk = _existing(earlier, trunk_id)
+        if earlier.source.fingerprint != document.source.fingerprint:
+            raise CommandError(f"Trunk {trunk_id} belongs to another cloud.")
+        if trunk_id in document.trunks:
+            raise CommandError(f"Trunk {trunk_id} is still there.", "Delete it first, or use Undo.")
+        _check_free(document.trunks, trunk)
+        trees = dict(document.trees)
+        if trunk_id in earlier.trees:
+            trees[trunk_id] = earlier.trees[trunk_id]
+        return replace(document, trunks=document.trunks.with_trunk(trunk), trees=trees)
+
+    return Command(f"Restore trunk {trunk_id}", apply)
+
+
+def set_tree_record(trunk_id: int, **values: Any) -> Command:
+    """Say something about a stem: `species`, `status`, `note`, `tag`, `tree_id` or `edited`."""
+
+    def apply(document: Document) -> Document:
+        _existing(document, trunk_id)
+        before = document.record(trunk_id)
+        try:
+            after = replace(before, **values)
+        except (TypeError, ValueError) as error:
+            raise CommandError(f"This cannot be said about trunk {trunk_id}: {error}.") from None
+        if after == before:
+            return document
+        trees = {i: record for i, record in document.trees.items() if i != trunk_id}
+        if after != TreeRecord():
+            trees[trunk_id] = after
+        return replace(document, trees=trees)
+
+    return Command(f"Describe trunk {trunk_id}", apply)
+
+
+def _existing(document: Document, trunk_id: int) -> Trunk:
+    if trunk_id not in document.trunks:
+        raise CommandError(f"There is no trunk {trunk_id}.")
+    return document.trunks[trunk_id]
+
+
+def _check_indices(trunks: Iterable[Trunk], n_points: int) -> None:
+    """Raise CommandError unless the trunks are disjoint and inside the cloud."""
+    is_taken = np.zeros(n_points, bool)
+    for trunk in trunks:
+        # Sorted, so that the ends tell the range.
+        if not len(trunk) or trunk.points[0] < 0 or trunk.points[-1] >= n_points:
+            raise CommandError(f"Trunk {trunk.id} has no points or points that are not in the cloud.")
+        if is_taken[trunk.points].any():
+            raise CommandError(f"Trunk {trunk.id} shares points with another trunk.")
+        is_taken[trunk.points] = True
+
+
+def _check_free(trunks: TrunkSet, wanted: Trunk) -> None:
+    for other in trunks:
+        if np.isin(wanted.points, other.points, assume_unique=True).any():
+            raise CommandError(
+                f"Points of trunk {wanted.id} now belong to trunk {other.id}.", f"Delete trunk {other.id} first."
+            )
+
+
+def _renumbered(trunks: TrunkSet, document: Document) -> TrunkSet:
+    """The trunks with the ids of the old trunks they are, and new ids for the others, in the order given."""
+    old = document.trunks
+    old_labels = old.labels(document.source.n_points)
+    new_id, numbered = old.next_id, []
+    for trunk in trunks:
+        labels, counts = np.unique(old_labels[trunk.points], return_counts=True)
+        counts[labels == 0] = 0
+        candidate, n_shared = int(labels[counts.argmax()]), int(counts.max())
+        n_union = len(trunk) + (len(old[candidate]) if candidate else 0) - n_shared
+        if candidate and n_shared > _SAME_TRUNK_IOU * n_union:
+            numbered.append(replace(trunk, id=candidate))
+        else:
+            numbered.append(replace(trunk, id=new_id))
+            new_id += 1
+    return TrunkSet(tuple(numbered), new_id)

@@ -1,0 +1,264 @@
+"""Opening a plot: a cloud, a mesh, a folder of them, or what was saved of one; and saving it elsewhere."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dbh_studio.app.autosave import Autosave, document_from_state
+from dbh_studio.app.commands import set_scale, set_up
+from dbh_studio.app.document import Direction, Document, SourceInfo, unit_direction
+from dbh_studio.app.session import Session
+from dbh_studio.core.progress import Progress, ignore_progress, subprogress
+from dbh_studio.core.scale import ScaleEstimate, ScaleSource
+from dbh_studio.core.transforms import UP_AXES
+from dbh_studio.errors import FileMissingError, ProjectError, SettingError
+from dbh_studio.io.project import PROJECT_FILE, ProjectWriter, is_project, read_project
+
+if TYPE_CHECKING:
+    from dbh_studio.core.datacheck import DataCheck
+    from dbh_studio.core.reconstruction import Reconstruction
+
+# Called as ``read(path, progress=…)``.
+Reader = Callable[..., "Reconstruction"]
+
+_UNITS: dict[str, tuple[float, ScaleSource]] = {
+    "metres": (1.0, "metres"),
+    "m": (1.0, "metres"),
+    "feet": (0.3048, "feet"),
+    "ft": (0.3048, "feet"),
+    # The survey foot of the USA, 1200/3937 m, in which its state plane coordinates were given until 2022.
+    "us-feet": (1200 / 3937, "feet"),
+    "centimetres": (0.01, "factor"),
+    "cm": (0.01, "factor"),
+    "millimetres": (0.001, "millimetres"),
+    "mm": (0.001, "millimetres"),
+}
+
+
+def scale_from(value: float | str | ScaleEstimate | None) -> ScaleEstimate:
+    """A scale as a person gives it: metres per unit, the name of a unit, or ``unknown``.
+
+    Raises:
+        SettingError: It is none of these, or not positive.
+    """
+    if isinstance(value, ScaleEstimate):
+        return value
+    if value is None or value == "unknown":
+        return ScaleEstimate()
+    if isinstance(value, str) and value.lower() in _UNITS:
+        metres_per_unit, source = _UNITS[value.lower()]
+        return ScaleEstimate(metres_per_unit, source)
+    try:
+        return ScaleEstimate(float(value), "factor")
+    except ValueError:
+        names = ", ".join(_UNITS)
+        raise SettingError(
+            f"The scale {value!r} was not understood.", f"Give metres per unit, such as 1.332, or one of: {names}."
+        ) from None
+
+
+@dataclass(frozen=True)
+class _Wish:
+    """What the person says about a cloud, where they do."""
+
+    scale: ScaleEstimate | None = None
+    up: Direction | None = None
+
+
+# ---- opening
+
+
+def open_plot(
+    path: Path | str,
+    *,
+    scale: float | str | ScaleEstimate | None = None,
+    up: str | Direction | None = None,
+    project_dir: Path | str | None = None,
+    read_only: bool = False,
+    relocate: Path | str | None = None,
+    background_save: bool = True,
+    read: Reader | None = None,
+    progress: Progress = ignore_progress,
+) -> Session:
+    """Open a cloud, a mesh, a folder of them, or a saved plot.
+
+    Args:
+        path: What to open. A saved plot (``NAME.dbh``) opens as it was left.
+        scale: Metres per unit, a unit's name, or None for what the data says; where that is nothing, it is unknown.
+        up: A named axis or a direction in the source; None for what the data says.
+        project_dir: Where to save from now on. If a plot of this cloud is there already, it is opened.
+        read_only: Write nothing and refuse commands; needs no lock.
+        relocate: Where the cloud of a saved plot is now.
+        background_save: Save on a thread of its own, see `Autosave`.
+        read: How to read the cloud: `read_cloud` here, or a call that runs it in a child process.
+
+    Raises:
+        FileError: The cloud cannot be read, or is not where the saved plot says.
+        ProjectError: The saved plot is damaged, locked, newer, or of another cloud.
+        SettingError: `scale` or `up` is not understood.
+    """
+    path = Path(path)
+    wish = _Wish(None if scale is None else scale_from(scale), None if up is None else _up_from(up))
+    if is_project(path):
+        folder, source = path, relocate
+    elif project_dir is not None and (Path(project_dir) / PROJECT_FILE).exists():
+        folder, source = Path(project_dir), path
+    else:
+        session = _open_new(path, wish, read or read_cloud, read_only=read_only, progress=progress)
+        # Only now: a cloud that cannot be read must not leave an empty saved plot.
+        if project_dir is not None and not read_only:
+            save_as(session, project_dir, background=background_save)
+        return session
+    session = _reopen(
+        folder, source, read or read_cloud, read_only=read_only, background=background_save, progress=progress
+    )
+    try:
+        if wish.up is not None:
+            session.do(set_up(wish.up))
+        if wish.scale is not None:
+            session.do(set_scale(wish.scale))
+    except BaseException:
+        session.close()
+        raise
+    return session
+
+
+def save_as(
+    session: Session,
+    folder: Path | str,
+    *,
+    overwrite: bool = False,
+    background: bool = True,
+    label: str = "Create the plot",
+) -> Autosave:
+    """Keep a plot in `folder` from now on; what it was kept in before stays as it is, and is released.
+
+    Args:
+        overwrite: Replace a plot that is there already.
+        label: What the history says of it.
+
+    Raises:
+        ProjectError: There is a saved plot already, or the folder cannot be written.
+    """
+    folder = Path(folder)
+    if (folder / PROJECT_FILE).exists() and not overwrite:
+        raise ProjectError(f"There is a saved plot in {folder.name} already.", "Choose another name, or open that one.")
+    writer = ProjectWriter(folder)
+    session.close()
+    return Autosave(session, writer, background=background, label=label)
+
+
+def _up_from(up: str | Direction) -> Direction:
+    try:
+        return unit_direction(up)
+    except ValueError as error:
+        raise SettingError(f"The up direction was not understood: {error}.") from None
+
+
+def read_cloud(path: Path, *, progress: Progress = ignore_progress) -> Reconstruction:
+    """Read what a plot is made from. Picklable, for a job."""
+    from dbh_studio.io.reader import read_reconstruction
+
+    return read_reconstruction(path, progress=progress, attributes="needed")
+
+
+def _open_new(path: Path, wish: _Wish, read: Reader, *, read_only: bool, progress: Progress) -> Session:
+    reconstruction = read(path, progress=subprogress(progress, 0.0, 0.8))
+    progress(0.8, "Looking at the data")
+    check = _check(reconstruction, wish)
+    document = Document(
+        plot_id=plot_name(path),
+        source=SourceInfo.of(reconstruction.cloud, path, reconstruction.used),
+        up_direction=wish.up or unit_direction(check.up_direction_src),
+        scale=wish.scale or scale_from_check(check),
+    )
+    progress(1.0, "")
+    return _session(reconstruction, document, check, read_only)
+
+
+def _check(reconstruction: Reconstruction, wish: _Wish) -> DataCheck:
+    """Look at the data in the light of what the person already said."""
+    from dbh_studio.core.datacheck import check_cloud
+
+    return check_cloud(
+        reconstruction.cloud,
+        up_axis=next((axis for axis in UP_AXES if wish.up == unit_direction(axis)), None),
+        metres_per_unit=wish.scale.metres_per_unit if wish.scale is not None and wish.scale.is_known else None,
+        provenance=reconstruction.provenance,
+    )
+
+
+def scale_from_check(check: DataCheck) -> ScaleEstimate:
+    """The scale the data itself tells; unknown where a person must say it."""
+    if check.needs_scale or check.metres_per_unit is None:
+        return ScaleEstimate()
+    sources: dict[str, ScaleSource] = {"metres": "metres", "feet": "feet", "millimetres": "millimetres"}
+    return ScaleEstimate(check.metres_per_unit, sources.get(check.unit, "factor"))
+
+
+def _session(reconstruction: Reconstruction, document: Document, check: DataCheck, read_only: bool) -> Session:
+    return Session(
+        reconstruction.cloud,
+        document,
+        data_check=check,
+        mesh=reconstruction.mesh,
+        notes=reconstruction.notes,
+        read_only=read_only,
+    )
+
+
+def plot_name(path: Path) -> str:
+    """What to call a plot until a person does: the file's name without suffix and without control characters."""
+    return re.sub(r"[\x00-\x1f\x7f]+", " ", path.absolute().stem).strip() or "plot"
+
+
+def _reopen(
+    folder: Path,
+    source: Path | str | None,
+    read: Reader,
+    *,
+    read_only: bool,
+    background: bool,
+    progress: Progress,
+) -> Session:
+    """Open a saved plot; locked before it is read, so that nobody writes it in between."""
+    if not (folder / PROJECT_FILE).exists():
+        read_project(folder)  # raises, with the words for it
+    writer = None if read_only else ProjectWriter(folder)
+    try:
+        state = read_project(folder)
+        path = Path(source) if source is not None else state.source_path
+        if not path.exists():
+            raise FileMissingError(
+                path,
+                f"The cloud of the saved plot {folder.name} is not there any more ({path}).",
+                "Put it back, or say where it is now.",
+            )
+        reconstruction = read(path, progress=subprogress(progress, 0.0, 0.8))
+        info = SourceInfo.of(reconstruction.cloud, path, reconstruction.used)
+        if (info.n_points, info.fingerprint) != (state.n_points, state.fingerprint):
+            raise _other_cloud(folder, path, state.n_points, info.n_points)
+        document = document_from_state(state, info)
+        check = _check(reconstruction, _Wish(document.scale, document.up_direction))
+        session = _session(reconstruction, document, check, read_only)
+        if writer is not None:
+            writer.adopt(state)
+            Autosave(session, writer, background=background, is_new=False)
+    except BaseException:
+        if writer is not None:
+            writer.close()
+        raise
+    progress(1.0, "")
+    return session
+
+
+def _other_cloud(folder: Path, path: Path, n_saved: int, n_found: int) -> ProjectError:
+    difference = f"it has {n_found:,} points instead of {n_saved:,}" if n_found != n_saved else "its points are others"
+    return ProjectError(
+        f"{path.name} is not the cloud that the saved plot {folder.name} was made from: {difference}.",
+        "Its trunks were not put on it. Put the original file back, or open this one as a new plot.",
+    )

@@ -1,0 +1,308 @@
+"""From a file to an inventory: what the browser does step by step, and the command line in one go."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dbh_studio.app.commands import change_settings, rename_plot, replace_trunks
+from dbh_studio.app.document import Direction, Document
+from dbh_studio.app.jobs import run_job
+from dbh_studio.app.opening import open_plot, plot_name, save_as, scale_from
+from dbh_studio.app.session import Session
+from dbh_studio.core.arrays import Float32
+from dbh_studio.core.progress import Progress, ignore_progress, subprogress
+from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.trunks import Trunk, TrunkSet
+from dbh_studio.errors import ProjectError
+from dbh_studio.io.inventory_csv import write_inventory_csv
+from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
+from dbh_studio.settings import GroundSettings, MeasureSettings, Settings
+
+if TYPE_CHECKING:
+    from dbh_studio.core.ground import GroundModel
+    from dbh_studio.stages.measure import StemMeasurement
+
+__all__ = [
+    "SEGMENTATION_READS",
+    "RunResult",
+    "apply_segmentation",
+    "measure_stems",
+    "measurement_call",
+    "open_plot",
+    "run_plot",
+    "save_as",
+    "scale_from",
+    "segment",
+    "segment_plot",
+    "segmentation_call",
+]
+
+# What a segmentation depends on; a job that ran while one of them changed is stale. Of the measurement it reads only
+# how many points are too few and the seed, which are no reason to throw away minutes of work.
+SEGMENTATION_READS = ("source", "up_direction", "scale", "settings.ground", "settings.trunks", "trunks")
+
+SegmentationResult = tuple["GroundModel", TrunkSet, tuple[str, ...]]
+
+
+# ---- finding trunks
+
+
+def segment_plot(
+    points_world: Float32,
+    settings: Settings,
+    existing_ids: NDArray[Any] | None = None,
+    *,
+    progress: Progress = ignore_progress,
+) -> SegmentationResult:
+    """Find the ground and the trunks. Pure and picklable, for a job.
+
+    Args:
+        points_world: (N, 3) points, metres, +z up.
+        settings: Of the ground and the trunks.
+        existing_ids: (N,) tree ids the cloud carries, or None. Trees with too few points to be measured are left out.
+
+    Returns:
+        The ground, the trunks and notes in plain words. Trunks that were found are numbered from west to east; those
+        taken over keep the file's numbers.
+    """
+    from dbh_studio.core.ground import fit_ground
+
+    ground = fit_ground(points_world, settings=settings.ground, progress=subprogress(progress, 0.0, 0.4))
+    notes = list(ground.notes)
+    trunks = TrunkSet()
+    if existing_ids is not None and settings.trunks.use_existing_ids:
+        trunks, remarks = _trunks_from_ids(existing_ids, settings.measure.min_points)
+        notes += remarks
+    if not len(trunks):
+        from dbh_studio.stages.segment import segment_trunks
+
+        found = segment_trunks(
+            points_world,
+            ground,
+            settings=settings.trunks,
+            progress=subprogress(progress, 0.4, 1.0),
+            seed=settings.measure.seed,
+        )
+        trunks = TrunkSet.from_point_sets(_in_order(found.point_sets, points_world))
+        notes += found.notes
+    progress(1.0, "")
+    return ground, trunks, tuple(notes)
+
+
+def _in_order(point_sets: Sequence[NDArray[Any]], points_world: Float32) -> list[NDArray[Any]]:
+    """From west to east, then south to north, by the median position to the centimetre."""
+
+    def position(points: NDArray[Any]) -> tuple[float, float, int]:
+        x, y = np.round(np.median(points_world[points, :2], axis=0).astype(np.float64), 2)
+        return float(x), float(y), int(points.min())
+
+    return sorted((points for points in point_sets if len(points)), key=position)
+
+
+def _trunks_from_ids(ids: NDArray[Any], min_points: int) -> tuple[TrunkSet, list[str]]:
+    """The trees the cloud's own ids tell apart, under these ids."""
+    from dbh_studio.core.treeids import point_sets_from_ids
+
+    groups = point_sets_from_ids(ids)
+    kept = [group for group in groups if len(group) >= min_points]
+    notes = [f"{len(kept)} trees were taken over from the file's own tree ids."] if kept else []
+    if len(groups) > len(kept):
+        n_dropped = len(groups) - len(kept)
+        notes.append(f"{n_dropped} trees of the file have fewer than {min_points} points and were left out.")
+    if kept and int(ids[kept[-1][0]]) >= 2**31 - 1:
+        notes.append("Their ids are too large, so they were numbered anew.")
+        return TrunkSet.from_point_sets(kept, origin="file"), notes
+    return TrunkSet(tuple(Trunk(int(ids[group[0]]), group.astype(np.int32), "file") for group in kept)), notes
+
+
+def segmentation_call(session: Session, document: Document) -> tuple[Float32, Settings, NDArray[Any] | None]:
+    """The arguments of `segment_plot` for a state of a plot.
+
+    Raises:
+        UnscaledCloudError: The scale is not known; says what to do.
+    """
+    from dbh_studio.core.treeids import find_tree_id_attribute
+
+    session.require_scale(document)
+    name = find_tree_id_attribute(session.cloud) if document.settings.trunks.use_existing_ids else None
+    ids = session.cloud.attributes[name] if name is not None else None
+    return session.points_world(document), document.settings, ids
+
+
+def apply_segmentation(session: Session, document: Document, result: SegmentationResult) -> None:
+    """Put the result of `segment_plot`, run for `document`, into the plot: one command.
+
+    Raises:
+        StaleResultError: What it was computed from has changed meanwhile.
+    """
+    ground, trunks, _ = result
+    session.remember_ground(document, ground)
+    session.do(replace_trunks(trunks), based_on=document, reads=SEGMENTATION_READS)
+
+
+def segment(session: Session, *, progress: Progress = ignore_progress, in_process: bool = False) -> tuple[str, ...]:
+    """Find the trunks of a plot and wait for them; the notes."""
+    document = session.document
+    call = segmentation_call(session, document)
+    result: SegmentationResult = run_job(segment_plot, *call, progress=progress, in_process=in_process)
+    apply_segmentation(session, document, result)
+    return result[2]
+
+
+# ---- measuring
+
+
+def measure_stems(
+    stems: Sequence[tuple[int, Float32]],
+    ground: GroundModel,
+    settings: MeasureSettings,
+    *,
+    progress: Progress = ignore_progress,
+) -> list[StemMeasurement]:
+    """Measure many stems, given as (id, (K, 3) points_world). Pure and picklable, for a job."""
+    from dbh_studio.stages.measure import measure_trunk
+
+    measured = []
+    for i, (trunk_id, points_world) in enumerate(stems):
+        progress(i / len(stems), f"Measuring stem {i + 1} of {len(stems)}")
+        measured.append(measure_trunk(points_world, trunk_id=trunk_id, ground=ground, settings=settings))
+    progress(1.0, "")
+    return measured
+
+
+def ground_of(points_world: Float32, settings: GroundSettings, *, progress: Progress = ignore_progress) -> GroundModel:
+    """The ground of a cloud. Pure and picklable, for a job; its result goes to ``session.remember_ground``."""
+    from dbh_studio.core.ground import fit_ground
+
+    return fit_ground(points_world, settings=settings, progress=progress)
+
+
+def ground_call(session: Session, document: Document) -> tuple[Float32, GroundSettings]:
+    """The arguments of `ground_of` for a state of a plot."""
+    return session.points_world(document), document.settings.ground
+
+
+def measurement_call(session: Session, document: Document) -> tuple[Any, ...]:
+    """The arguments of `measure_stems` for the stems of a state that are not measured yet.
+
+    Give the result to ``session.remember_measurements(document, result)``; it is right whatever happened meanwhile.
+    """
+    points_world = session.points_world(document)
+    stems = [(i, points_world[document.trunks[i].points]) for i in session.unmeasured(document)]
+    return stems, session.ground(document=document), document.settings.measure
+
+
+# ---- all at once
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """What `run_plot` made.
+
+    Attributes:
+        session: The plot, still open; close it.
+        csv_path: The inventory.
+        project_dir: The saved plot.
+        notes: What the person should know, in plain words.
+        timings_s: Seconds by step.
+    """
+
+    session: Session
+    csv_path: Path
+    project_dir: Path
+    notes: tuple[str, ...]
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+
+def run_plot(
+    path: Path | str,
+    out_dir: Path | str,
+    *,
+    scale: float | str | ScaleEstimate | None = None,
+    up: str | Direction | None = None,
+    settings: Settings | None = None,
+    plot_id: str = "",
+    overwrite: bool = False,
+    in_process: bool = True,
+    progress: Progress = ignore_progress,
+) -> RunResult:
+    """Read a plot, find its trunks, measure them, and write ``NAME.csv`` and the saved plot ``NAME.dbh``.
+
+    A saved plot is measured where it is, with the trunks it has; trunks are looked for only if it has none.
+
+    Args:
+        settings: Instead of the defaults, or of those the saved plot has.
+        plot_id: What to call the plot; the file's name by default.
+        overwrite: Replace a plot that an earlier run left in `out_dir`. Edits made in it are lost.
+        in_process: Work here rather than in a child process.
+
+    Raises:
+        UnscaledCloudError: The data does not tell its unit and no scale was given.
+        ProjectError: `out_dir` has such a plot already and `overwrite` is False.
+        StudioError: What `open_plot` and the stages raise.
+    """
+    path, out_dir = Path(path), Path(out_dir)
+    name = re.sub(r'[\\/:*?"<>|]+', "_", plot_id or plot_name(path)).strip(". ") or "plot"
+    is_saved = is_project(path)
+    project_dir = path if is_saved else out_dir / f"{name}{FOLDER_SUFFIX}"
+    if not is_saved and not overwrite and (project_dir / PROJECT_FILE).exists():
+        raise ProjectError(
+            f"There is a saved plot {project_dir.name} from an earlier run, perhaps with edits.",
+            "Run on it to measure it again, choose another folder, or say that it may be overwritten.",
+        )
+    timings_s: dict[str, float] = {}
+    with _timed(timings_s, "read"):
+        part = subprogress(progress, 0.0, 0.3)
+        session = open_plot(path, scale=scale, up=up, background_save=False, progress=part)
+    try:
+        _configure(session, settings, plot_id)
+        session.require_scale()
+        notes = [*session.notes]
+        if not len(session.document.trunks):
+            with _timed(timings_s, "ground and trunks"):
+                notes += segment(session, progress=subprogress(progress, 0.3, 0.7), in_process=in_process)
+        with _timed(timings_s, "diameters"):
+            inventory = session.inventory(subprogress(progress, 0.7, 0.99))
+        with _timed(timings_s, "write"):
+            if not is_saved:
+                label = f"Create the plot and find {len(inventory)} trunks"
+                save_as(session, project_dir, overwrite=overwrite, background=False, label=label)
+            csv_path = write_inventory_csv(out_dir / f"{name}.csv", inventory)
+            _flush(session)
+    except BaseException:
+        session.close()
+        raise
+    if inventory.n_refused:
+        notes.append(f"{inventory.n_refused} of {len(inventory)} stems have no diameter; the table says why.")
+    progress(1.0, "")
+    return RunResult(session, csv_path, project_dir, tuple(notes), timings_s)
+
+
+@contextmanager
+def _timed(timings_s: dict[str, float], step: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    timings_s[step] = time.perf_counter() - start
+
+
+def _configure(session: Session, settings: Settings | None, plot_id: str) -> None:
+    if plot_id:
+        session.do(rename_plot(plot_id))
+    if settings is not None:
+        for section in type(settings).model_fields:
+            session.do(change_settings(section, **getattr(settings, section).model_dump()))
+
+
+def _flush(session: Session) -> None:
+    saver = session.saver
+    if saver is not None and not saver.flush():
+        raise ProjectError(saver.status.problem)

@@ -1,0 +1,340 @@
+"""The Session: the only writer of a plot. Browser, command line and tests send it commands."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from dbh_studio.app.commands import Command
+from dbh_studio.app.derived import UNSCALED_REASON, UNSCALED_REMEDY, Derived
+from dbh_studio.app.document import Document
+from dbh_studio.core.arrays import Float32
+from dbh_studio.core.cloud import PointCloud
+from dbh_studio.core.inventory import Inventory
+from dbh_studio.core.progress import Progress, ignore_progress
+from dbh_studio.errors import CommandError, StaleResultError, UnscaledCloudError
+
+if TYPE_CHECKING:
+    from dbh_studio.app.autosave import Autosave
+    from dbh_studio.core.datacheck import DataCheck
+    from dbh_studio.core.ground import GroundModel
+    from dbh_studio.stages.measure import StemMeasurement
+
+_log = logging.getLogger(__name__)
+
+HISTORY_LIMIT = 200
+
+_FIELDS = {
+    "plot_id": "the name of the plot",
+    "source": "the cloud",
+    "up_direction": "the up direction",
+    "scale": "the scale",
+    "settings": "the settings",
+    "settings.ground": "the ground settings",
+    "settings.trunks": "the trunk settings",
+    "settings.measure": "the measurement settings",
+    "trunks": "the trunks",
+    "trees": "what is said about the trees",
+}
+_ALL_FIELDS = tuple(name for name in _FIELDS if "." not in name)
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """What happened. A listener compares fields by identity: ``after.trunks is not before.trunks``."""
+
+    before: Document
+    after: Document
+    label: str
+
+
+Listener = Callable[[Change], None]
+
+
+class Session:
+    """One open plot: its cloud, its Document, and the Documents it was before.
+
+    Every method may be called from any thread. Listeners are told of changes one at a time and in order, by a
+    thread that made one; a listener may itself send commands.
+
+    Args:
+        cloud: The points; they never change.
+        document: The state to begin with.
+        data_check: What was found out about the cloud when it was read.
+        mesh: The reconstruction's mesh, for display.
+        notes: What the reader of the cloud has to say, in plain words.
+        read_only: Refuse every command.
+        history_limit: How many commands can be undone.
+        derived: For tests.
+
+    Raises:
+        ValueError: The document belongs to a cloud with another number of points.
+    """
+
+    def __init__(
+        self,
+        cloud: PointCloud,
+        document: Document,
+        *,
+        data_check: DataCheck | None = None,
+        mesh: Any = None,
+        notes: Iterable[str] = (),
+        read_only: bool = False,
+        history_limit: int = HISTORY_LIMIT,
+        derived: Derived | None = None,
+    ) -> None:
+        if document.source.n_points != len(cloud):
+            raise ValueError(f"the document is about {document.source.n_points} points but the cloud has {len(cloud)}")
+        self.cloud = cloud
+        self.data_check = data_check
+        self.mesh = mesh
+        self.notes = tuple(notes)
+        self.is_read_only = read_only
+        self.saver: Autosave | None = None
+        self._document = document
+        self._derived = derived or Derived(cloud)
+        self._next_id = document.trunks.next_id
+        self._past: deque[tuple[str, Document]] = deque(maxlen=history_limit)
+        self._future: list[tuple[str, Document]] = []
+        self._lock = threading.RLock()
+        self._listeners: list[Listener] = []
+        self._untold: deque[Change] = deque()
+        self._telling = threading.RLock()
+        self._is_telling = False
+
+    # ---- the state
+
+    @property
+    def document(self) -> Document:
+        """The plot as it is now; an immutable value that may be kept."""
+        return self._document
+
+    @property
+    def next_id(self) -> int:
+        """The lowest trunk id never given out in this plot, undone commands included."""
+        return self._next_id
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a command to undo."""
+        return bool(self._past)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is an undone command."""
+        return bool(self._future)
+
+    @property
+    def undo_label(self) -> str:
+        """What Undo would undo; empty where nothing."""
+        with self._lock:
+            return self._past[-1][0] if self._past else ""
+
+    @property
+    def redo_label(self) -> str:
+        """What Redo would do again; empty where nothing."""
+        with self._lock:
+            return self._future[-1][0] if self._future else ""
+
+    # ---- the only ways to change it
+
+    def do(self, command: Command, *, based_on: Document | None = None, reads: Iterable[str] = ()) -> Change:
+        """Apply a command to the plot as it is now.
+
+        Args:
+            command: The edit. One that changes nothing leaves no trace.
+            based_on: The Document the command's values were computed from, for the result of a job.
+            reads: Fields of it that they were computed from: ``scale``, ``settings.trunks``, …; all, if none is named.
+
+        Raises:
+            CommandError: It cannot be applied; nothing has changed.
+            StaleResultError: A field of `reads` is no longer what it was; nothing has changed, other edits are kept.
+        """
+        with self._lock:
+            self._check_writable()
+            before = self._document
+            if based_on is not None:
+                _check_fresh(based_on, before, tuple(reads) or _ALL_FIELDS)
+            after = self._apply(command, before)
+            change = Change(before, after, command.label)
+            if after is before:
+                return change
+            self._past.append((command.label, before))
+            self._future.clear()
+            self._move_to(change)
+        self._tell()
+        return change
+
+    def undo(self) -> Change:
+        """Go back to the Document before the last command.
+
+        Raises:
+            CommandError: There is nothing to undo.
+        """
+        with self._lock:
+            self._check_writable()
+            if not self._past:
+                raise CommandError("There is nothing to undo.")
+            label, earlier = self._past.pop()
+            self._future.append((label, self._document))
+            change = Change(self._document, earlier, f"Undo: {label}")
+            self._move_to(change)
+        self._tell()
+        return change
+
+    def redo(self) -> Change:
+        """Go forward to the Document that was undone.
+
+        Raises:
+            CommandError: There is nothing to redo.
+        """
+        with self._lock:
+            self._check_writable()
+            if not self._future:
+                raise CommandError("There is nothing to redo.")
+            label, later = self._future.pop()
+            self._past.append((label, self._document))
+            change = Change(self._document, later, f"Redo: {label}")
+            self._move_to(change)
+        self._tell()
+        return change
+
+    def _check_writable(self) -> None:
+        if self.is_read_only:
+            raise CommandError("The plot is open for reading only.", "Open it for writing to change it.")
+
+    def _apply(self, command: Command, before: Document) -> Document:
+        """Apply with ids counted on from all ever given out: an undone trunk's number may stand in somebody's notes."""
+        trunks = before.trunks
+        if trunks.next_id < self._next_id:
+            trunks = replace(trunks, next_id=self._next_id)
+        base = before if trunks is before.trunks else replace(before, trunks=trunks)
+        after = command.apply(base)
+        if after is base:
+            return before
+        return replace(after, trunks=before.trunks) if after.trunks is trunks is not before.trunks else after
+
+    def _move_to(self, change: Change) -> None:
+        self._document = change.after
+        self._next_id = max(self._next_id, change.after.trunks.next_id)
+        self._untold.append(change)
+
+    # ---- listeners
+
+    def subscribe(self, listener: Listener) -> Callable[[], None]:
+        """Call `listener` after every change; returns the function that ends it."""
+        with self._lock:
+            self._listeners.append(listener)
+
+        def unsubscribe() -> None:
+            with self._lock:
+                if listener in self._listeners:
+                    self._listeners.remove(listener)
+
+        return unsubscribe
+
+    def _tell(self) -> None:
+        with self._telling:
+            if self._is_telling:
+                # A listener sent a command: whoever is telling goes on with this change after the one at hand.
+                return
+            self._is_telling = True
+            try:
+                while self._untold:
+                    change = self._untold.popleft()
+                    for listener in tuple(self._listeners):
+                        self._tell_one(listener, change)
+            finally:
+                self._is_telling = False
+
+    @staticmethod
+    def _tell_one(listener: Listener, change: Change) -> None:
+        try:
+            listener(change)
+        except Exception:  # noqa: BLE001
+            # The change has happened and the others must hear of it.
+            _log.exception("A listener failed after %r", change.label)
+
+    # ---- derived values
+
+    def points_world(self, document: Document | None = None) -> Float32:
+        """(N, 3) float32 points in the world frame, read-only; the cloud's memory where the transform is the identity.
+
+        Args:
+            document: The state to transform for, where a job must not mix two; the present one by default.
+        """
+        return self._derived.points_world(document or self._document)
+
+    def ground(self, progress: Progress = ignore_progress, *, document: Document | None = None) -> GroundModel:
+        """The ground of the plot as it is now (or was), fitted where it is not known."""
+        return self._derived.ground(document or self._document, progress)
+
+    def has_ground(self) -> bool:
+        """Whether `ground` answers at once."""
+        return self._derived.has_ground(self._document)
+
+    def remember_ground(self, document: Document, ground: GroundModel) -> None:
+        """Keep a ground that a job fitted for `document`."""
+        self._derived.put_ground(document, ground)
+
+    def measurement(self, trunk_id: int) -> StemMeasurement:
+        """The diameter of one stem, or why there is none.
+
+        Raises:
+            KeyError: There is no such trunk.
+        """
+        return self._derived.measurement(self._document, trunk_id)
+
+    def measurements(self, progress: Progress = ignore_progress) -> tuple[StemMeasurement, ...]:
+        """All stems, in order of id."""
+        return self._derived.measurements(self._document, progress)
+
+    def unmeasured(self, document: Document | None = None) -> tuple[int, ...]:
+        """The stems `measurements` would have to measure."""
+        document = document or self._document
+        if not document.scale.is_known:
+            return ()
+        return tuple(i for i in document.trunks.ids if self._derived.known_measurement(document, i) is None)
+
+    def remember_measurements(self, document: Document, measurements: Iterable[StemMeasurement]) -> None:
+        """Keep what a job measured for `document`."""
+        for measurement in measurements:
+            self._derived.put_measurement(document, measurement)
+
+    def inventory(self, progress: Progress = ignore_progress) -> Inventory:
+        """One row per stem."""
+        return self._derived.inventory(self._document, progress)
+
+    def require_scale(self, document: Document | None = None) -> None:
+        """Raise UnscaledCloudError, which says what to do, unless lengths are in metres."""
+        if not (document or self._document).scale.is_known:
+            raise UnscaledCloudError(UNSCALED_REASON, UNSCALED_REMEDY)
+
+    def close(self) -> None:
+        """Save what is left and release the saved plot. The Session must not be used afterwards."""
+        saver, self.saver = self.saver, None
+        if saver is not None:
+            saver.close()
+
+
+def _field(document: Document, name: str) -> Any:
+    value: Any = document
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value
+
+
+def _check_fresh(then: Document, now: Document, reads: tuple[str, ...]) -> None:
+    for name in reads:
+        if name not in _FIELDS:
+            raise ValueError(f"{name!r} is not a field of a Document")
+        value_then, value_now = _field(then, name), _field(now, name)
+        if value_then is not value_now and value_then != value_now:
+            raise StaleResultError(
+                f"While the work ran, {_FIELDS[name]} changed, so its result no longer fits and was not used.",
+                "Start it again.",
+            )

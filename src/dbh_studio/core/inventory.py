@@ -1,0 +1,232 @@
+"""The inventory: one row per stem, with everything needed to judge and to repeat its number.
+
+What is not known is None, never 0. Column names carry their units. `io.inventory_csv` writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from dbh_studio.core.arrays import Float64
+from dbh_studio.core.scale import ScaleEstimate
+
+# `core.dbh` needs scipy, which takes a second to import; the saved plot needs only `TreeRecord` from here.
+if TYPE_CHECKING:
+    from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal
+
+TreeStatus = Literal["live", "dead", ""]
+TREE_STATUSES: tuple[TreeStatus, ...] = ("live", "dead", "")
+
+
+@dataclass(frozen=True)
+class TreeRecord:
+    """What a person says about a stem; nothing here is computed.
+
+    Attributes:
+        species: Name or code as the person writes it.
+        status: ``live``, ``dead`` or empty where nobody said.
+        note: Free text.
+        tag: The number on the tree's tag.
+        edited: Whether a person changed the stem's points.
+        tree_id: The tree this stem belongs to; None where the stem is a tree of its own.
+    """
+
+    species: str = ""
+    status: TreeStatus = ""
+    note: str = ""
+    tag: str = ""
+    edited: bool = False
+    tree_id: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("species", "note", "tag"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} is {getattr(self, name)!r} but must be text")
+        if self.status not in TREE_STATUSES:
+            raise ValueError(f"status is {self.status!r} but must be one of {TREE_STATUSES}")
+        if self.tree_id is not None and self.tree_id <= 0:
+            raise ValueError(f"tree id is {self.tree_id} but must be positive")
+
+
+@dataclass(frozen=True)
+class MapPosition:
+    """Where a stem stands in the source's coordinate reference system, in that system's unit."""
+
+    easting: float
+    northing: float
+    epsg: int | None = None
+
+
+@dataclass(frozen=True)
+class InventoryRow:
+    """One stem. The fields are the columns, in their order.
+
+    Attributes:
+        tree_id: The tree the stem belongs to; `stem_id` is unique in the plot.
+        hom_m: Height of measurement above ground.
+        n_points: Points of the section that support the curve; all of the section where there is no diameter.
+        lean_deg: None where the axis was assumed vertical for want of stem.
+        quality: ``good``, ``fair``, ``poor``, or ``refused`` where `dbh_cm` is None.
+        reason: Why it is refused, or what to look at; `remedy` says what would help.
+        x_m: With `y_m` and `z_ground_m`, in the world frame: metres about the plot's local origin, z up.
+        scale_err_pct: Standard error of the scale; every length has it on top of its own.
+        easting: With `northing`, in the source's coordinate reference system, where it has one.
+    """
+
+    plot_id: str
+    tree_id: int
+    stem_id: int
+    tag: str
+    status: str
+    species: str
+    dbh_cm: float | None
+    dbh_method: str
+    dbh_definition: str
+    hom_m: float | None
+    coverage_deg: float | None
+    max_gap_deg: float | None
+    rmse_mm: float | None
+    n_points: int | None
+    lean_deg: float | None
+    quality: str
+    reason: str
+    remedy: str
+    edited: bool
+    x_m: float | None
+    y_m: float | None
+    z_ground_m: float | None
+    scale_source: str
+    scale_err_pct: float | None
+    note: str
+    easting: float | None
+    northing: float | None
+    epsg: int | None
+
+
+COLUMNS: tuple[str, ...] = tuple(column.name for column in fields(InventoryRow))
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """The rows in order of stem id. A table to read; it is never edited."""
+
+    rows: tuple[InventoryRow, ...] = ()
+
+    @classmethod
+    def of(cls, rows: Iterable[InventoryRow]) -> Inventory:
+        """Put rows in order of stem id.
+
+        Raises:
+            ValueError: Two rows have the same stem id.
+        """
+        ordered = tuple(sorted(rows, key=lambda row: row.stem_id))
+        if len({row.stem_id for row in ordered}) != len(ordered):
+            raise ValueError("two rows have the same stem id")
+        return cls(ordered)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[InventoryRow]:
+        return iter(self.rows)
+
+    @property
+    def n_measured(self) -> int:
+        """How many stems have a diameter."""
+        return sum(row.dbh_cm is not None for row in self.rows)
+
+    @property
+    def n_refused(self) -> int:
+        """How many stems have none."""
+        return len(self.rows) - self.n_measured
+
+
+def _known(value: float | None) -> float | None:
+    """`value` where it is a number; NaN and infinity are not known."""
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _chosen_fit(result: DbhEstimate | Refusal) -> CurveFit | None:
+    from dbh_studio.core.dbh import CurveFit, DbhEstimate
+
+    fit = result.fits.get(result.curve) if isinstance(result, DbhEstimate) else None
+    return fit if isinstance(fit, CurveFit) else None
+
+
+def inventory_row(
+    result: DbhEstimate | Refusal,
+    *,
+    plot_id: str,
+    stem_id: int,
+    record: TreeRecord,
+    xy_m: Float64,
+    z_ground_m: float,
+    scale: ScaleEstimate,
+    edited: bool = False,
+    position: MapPosition | None = None,
+) -> InventoryRow:
+    """The row of one stem.
+
+    Args:
+        result: Its diameter, or why there is none.
+        record: What a person said about it.
+        xy_m: (2,) position in the world frame; NaN where unknown.
+        edited: Whether a person made or changed the stem's points (besides `record.edited`).
+        position: In the source's coordinate reference system, where it has one.
+    """
+    section, fit = result.section, _chosen_fit(result)
+    # An assumed axis tells nothing about the lean.
+    lean_deg = section.lean_deg if section is not None and section.axis_source != "vertical" else None
+    error_pct = 100.0 * scale.standard_error / scale.metres_per_unit if scale.standard_error is not None else None
+    return InventoryRow(
+        plot_id=plot_id,
+        tree_id=record.tree_id or stem_id,
+        stem_id=stem_id,
+        tag=record.tag,
+        status=record.status,
+        species=record.species,
+        **_result_cells(result),
+        hom_m=_known(section.hom_m) if section else None,
+        coverage_deg=_known(section.coverage_deg) if section else None,
+        max_gap_deg=_known(section.max_gap_deg) if section else None,
+        rmse_mm=_known(1000.0 * fit.rmse_m) if fit else None,
+        n_points=int(fit.inliers.sum()) if fit else len(section.indices) if section else None,
+        lean_deg=_known(lean_deg),
+        edited=edited or record.edited,
+        x_m=_known(float(xy_m[0])),
+        y_m=_known(float(xy_m[1])),
+        z_ground_m=_known(z_ground_m),
+        scale_source=scale.source,
+        scale_err_pct=_known(error_pct),
+        note=record.note,
+        easting=_known(position.easting) if position else None,
+        northing=_known(position.northing) if position else None,
+        epsg=position.epsg if position else None,
+    )
+
+
+def _result_cells(result: DbhEstimate | Refusal) -> dict[str, Any]:
+    """The columns that an estimate and a refusal fill differently."""
+    from dbh_studio.core.dbh import DbhEstimate
+
+    if isinstance(result, DbhEstimate):
+        return {
+            "dbh_cm": _known(result.dbh_cm),
+            "dbh_method": result.curve,
+            "dbh_definition": result.definition,
+            "quality": result.quality,
+            "reason": "; ".join(result.flags),
+            "remedy": "",
+        }
+    return {
+        "dbh_cm": None,
+        "dbh_method": "",
+        "dbh_definition": "",
+        "quality": "refused",
+        "reason": result.reason,
+        "remedy": result.remedy,
+    }
