@@ -1,0 +1,75 @@
+"""Inputs made from the settings models: titles, units, bounds and help are written once, in `settings.py`."""
+
+from __future__ import annotations
+
+import typing
+from typing import Any, Generic, TypeVar
+
+import viser
+
+from dbh_studio.settings import SettingsModel
+from dbh_studio.ui.panels.base import set_value
+
+Model = TypeVar("Model", bound=SettingsModel)
+
+
+class SettingsForm(Generic[Model]):
+    """One input for each field of a settings model. Nothing takes effect until the form is read.
+
+    A value that is half typed is not a decision, so the plot changes only when a button reads the whole form.
+    """
+
+    def __init__(self, gui: viser.GuiApi, values: Model, *, names: tuple[str, ...] | None = None) -> None:
+        """Add the inputs at the GUI's current place.
+
+        Args:
+            gui: The tab's GUI.
+            values: The model to show.
+            names: Fields to show, in this order; all where None.
+        """
+        self._values = values
+        chosen = names if names is not None else tuple(type(values).model_fields)
+        self._handles = {name: _add_input(gui, values, name) for name in chosen}
+
+    def handle(self, name: str) -> Any:
+        """The input of one field, for those that take effect at once."""
+        return self._handles[name]
+
+    def read(self) -> Model:
+        """The model as the inputs say.
+
+        Raises:
+            SettingError: A value is outside its bounds; it says which one and what is allowed.
+        """
+        changed: Model = self._values.changed(**{name: handle.value for name, handle in self._handles.items()})
+        return changed
+
+    def show(self, values: Model) -> None:
+        """Bring the inputs in step with a changed model (undo, reopen, another tab)."""
+        self._values = values
+        for name, handle in self._handles.items():
+            set_value(handle, getattr(values, name))
+
+
+def _add_input(gui: viser.GuiApi, values: SettingsModel, name: str) -> Any:
+    field = type(values).model_fields[name]
+    extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+    unit = str(extra.get("unit", ""))
+    label = f"{field.title} ({unit})" if unit else str(field.title)
+    value, hint = getattr(values, name), field.description or None
+    if typing.get_origin(field.annotation) is typing.Literal:
+        return gui.add_dropdown(label, typing.get_args(field.annotation), initial_value=value, hint=hint)
+    if isinstance(value, bool):
+        return gui.add_checkbox(label, value, hint=hint)
+    low, high = bounds(type(values), name)
+    step: Any = 1 if isinstance(value, int) else 0.01 if value < 10 else 0.5
+    return gui.add_number(label, value, min=low, max=high, step=step, hint=hint)
+
+
+def bounds(model: type[SettingsModel], name: str) -> tuple[Any, Any]:
+    """Lower and upper bound of a field, None where open."""
+    low = high = None
+    for rule in model.model_fields[name].metadata:
+        low = getattr(rule, "ge", low)
+        high = getattr(rule, "le", high)
+    return low, high

@@ -1,0 +1,47 @@
+"""What every panel is: a part of the tab that is built once and brought in step with the plot."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from dbh_studio.ui.steps import StepName
+
+if TYPE_CHECKING:
+    from dbh_studio.ui.tab import Tab
+
+
+class Panel:
+    """One step of the work. Subclasses add their inputs in `build` and show the plot in `refresh`."""
+
+    step: StepName
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab = tab
+        self.gui = tab.client.gui
+        self.folder = self.gui.add_folder(None, visible=False)
+        with self.folder:
+            self.build()
+
+    def build(self) -> None:
+        """Add the panel's inputs at the GUI's current place."""
+        raise NotImplementedError
+
+    def refresh(self) -> None:
+        """Show the plot as it is now; cheap where nothing changed."""
+
+    def show(self, visible: bool) -> None:
+        """Show or hide the whole panel."""
+        if self.folder.visible != visible:
+            self.folder.visible = visible
+
+
+def set_value(handle: Any, value: Any) -> None:
+    """Show a value in an input, where it is not there already: an assignment is a message to the page."""
+    if handle.value != value:
+        handle.value = value
+
+
+def set_content(handle: Any, content: str) -> None:
+    """Assign HTML only where it differs: the same text again would still reset the scroll position."""
+    if handle.content != content:
+        handle.content = content

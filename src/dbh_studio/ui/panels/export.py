@@ -1,0 +1,54 @@
+"""Step 5: hand it in."""
+
+from __future__ import annotations
+
+import viser
+
+from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.io.inventory_csv import inventory_csv
+from dbh_studio.ui import html
+from dbh_studio.ui.panels.base import Panel, set_content
+
+
+class ExportPanel(Panel):
+    """The inventory as CSV, and where the plot is saved."""
+
+    step = "export"
+
+    def build(self) -> None:
+        """Add the inputs."""
+        self._state = self.gui.add_html("")
+        button = self.gui.add_button("Download the inventory (CSV)", icon=viser.Icon.DOWNLOAD, color="green")
+        self.tab.worker.on_click(button, self._export)
+
+    def refresh(self) -> None:
+        """Say what will be in the file."""
+        session = self.tab.session
+        if session is None or not len(session.document.trunks):
+            set_content(self._state, html.message("There is nothing to export yet: find the trunks first."))
+            return
+        results = [session.measurement(i).result for i in session.document.trunks.ids if i not in session.unmeasured()]
+        diameters = [result.dbh_cm for result in results if isinstance(result, DbhEstimate)]
+        pairs = [
+            ("Stems", str(len(session.document.trunks))),
+            ("With a diameter", str(len(diameters))),
+            ("Without, reason in the file", str(len(results) - len(diameters))),
+        ]
+        if diameters:
+            pairs.append(
+                (
+                    "Mean, range",
+                    f"{sum(diameters) / len(diameters):.1f} cm, {min(diameters):.1f}–{max(diameters):.1f} cm",
+                )
+            )
+        pairs.append(("Saved plot", self.tab.studio.saved_text()))
+        set_content(self._state, f'<div class="dbh">{html.facts(pairs)}</div>')
+
+    def _export(self) -> None:
+        session = self.tab.require_session()
+        document = session.document
+        content = inventory_csv(session.inventory())
+        name = f"{document.plot_id}_inventory.csv"
+        self.tab.client.send_file_download(name, content, save_immediately=True)
+        self.tab.studio.exported(document)
+        self.tab.worker.notify("Inventory exported", f"{name}, {len(document.trunks)} stems.", "success")

@@ -1,0 +1,83 @@
+"""Step 1: open a reconstruction, and read in plain words what it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import viser
+
+from dbh_studio.app import commands
+from dbh_studio.core.transforms import UP_AXES
+from dbh_studio.errors import FileMissingError, StudioError
+from dbh_studio.ui import html
+from dbh_studio.ui.panels.base import Panel, set_content, set_value
+from dbh_studio.ui.uploads import UploadedFile
+
+_UP_AS_FOUND = "as recognised"
+
+
+class OpenPanel(Panel):
+    """A path on this computer, or a file from the browser; then the data check."""
+
+    step = "open"
+
+    def build(self) -> None:
+        """Add the inputs."""
+        tab, gui = self.tab, self.gui
+        self._path = gui.add_text(
+            "File or folder",
+            "",
+            hint="on the computer the studio runs on: a cloud, a mesh, a folder, or a saved NAME.dbh",
+        )
+        open_button = gui.add_button("Open", icon=viser.Icon.FOLDER_OPEN, color="green")
+        tab.worker.on_click(open_button, self._open)
+        suffixes = tab.studio.suffixes()
+        upload = gui.add_upload_button(
+            "Upload a cloud",
+            icon=viser.Icon.UPLOAD,
+            mime_type=",".join(suffixes),
+            hint="a large file is better opened by its path",
+        )
+        tab.worker.on_upload(upload, self._uploaded, allowed_suffixes=suffixes, on_progress=self._uploading)
+        self._upload_bar = gui.add_progress_bar(0.0, visible=False)
+        self._check = gui.add_html("")
+        self._up = gui.add_dropdown("Up in the file", (_UP_AS_FOUND, *UP_AXES), visible=False, hint="turns the cloud")
+        tab.worker.on_update(self._up, self._set_up)
+
+    def refresh(self) -> None:
+        """Show the data check of the open plot."""
+        session = self.tab.session
+        self._up.visible = session is not None
+        if session is None:
+            set_content(self._check, html.message(f"Reads {self.tab.studio.formats()}.", level="ok"))
+            return
+        set_value(self._path, str(session.document.source.path))
+        check = session.data_check
+        items = [("note", note, "") for note in session.notes]
+        if check is not None:
+            items += [(finding.level, finding.message, finding.remedy) for finding in check.findings]
+        set_content(self._check, html.findings(items))
+
+    def _open(self) -> None:
+        text = self._path.value.strip().strip("\"'")
+        if not text:
+            raise StudioError("No file was named.", "Type the path of a cloud, or use Upload a cloud.")
+        path = Path(text).expanduser()
+        if not path.exists():
+            raise FileMissingError(path, "there is no such file or folder on this computer.", "Check the path.")
+        self.tab.studio.open_plot(path)
+
+    def _uploading(self, n_received: int, n_total: int) -> None:
+        self._upload_bar.visible = n_received < n_total
+        set_value(self._upload_bar, 100.0 * n_received / n_total)
+
+    def _uploaded(self, uploaded: UploadedFile) -> None:
+        self._upload_bar.visible = False
+        self.tab.studio.open_upload(uploaded)
+
+    def _set_up(self, choice: str) -> None:
+        session = self.tab.session
+        if session is None:
+            return
+        recognised = session.data_check.up_direction_src if session.data_check is not None else (0.0, 0.0, 1.0)
+        session.do(commands.set_up(recognised if choice == _UP_AS_FOUND else choice))

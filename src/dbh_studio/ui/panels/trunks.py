@@ -1,0 +1,56 @@
+"""Step 3: find the trunks."""
+
+from __future__ import annotations
+
+import viser
+
+from dbh_studio.app import commands
+from dbh_studio.ui import html
+from dbh_studio.ui.forms import SettingsForm
+from dbh_studio.ui.panels.base import Panel, set_content
+
+
+class TrunksPanel(Panel):
+    """One button; the settings behind it for those who need them."""
+
+    step = "trunks"
+
+    def build(self) -> None:
+        """Add the inputs."""
+        gui, settings = self.gui, self.tab.settings()
+        self._state = gui.add_html("")
+        button = gui.add_button("Find trunks", icon=viser.Icon.TREES, color="green")
+        self.tab.worker.on_click(button, self._find)
+        with gui.add_folder("Ground settings", expand_by_default=False):
+            self._ground = SettingsForm(gui, settings.ground)
+        with gui.add_folder("Trunk settings", expand_by_default=False):
+            self._trunks = SettingsForm(gui, settings.trunks)
+
+    def refresh(self) -> None:
+        """Say what was found, and bring the settings in step."""
+        session = self.tab.session
+        if session is None:
+            set_content(self._state, html.message("Open a plot first."))
+            return
+        settings = session.document.settings
+        self._ground.show(settings.ground)
+        self._trunks.show(settings.trunks)
+        n_trunks = len(session.document.trunks)
+        if not session.document.scale.is_known:
+            set_content(self._state, html.message("Set the scale first: trunk sizes are in metres.", level="stop"))
+        elif n_trunks:
+            notes = [("note", note, "") for note in self.tab.studio.segmentation_notes]
+            found = html.message(
+                f"{n_trunks} trunks. Finding them again keeps the numbers of those found again.", level="ok"
+            )
+            set_content(self._state, found + html.findings(notes))
+        else:
+            notes = [("warn", note, "") for note in self.tab.studio.segmentation_notes]
+            set_content(self._state, html.findings(notes) if notes else "")
+
+    def _find(self) -> None:
+        session = self.tab.require_session()
+        ground, trunks = self._ground.read(), self._trunks.read()
+        session.do(commands.change_settings("ground", **ground.model_dump()))
+        session.do(commands.change_settings("trunks", **trunks.model_dump()))
+        self.tab.studio.find_trunks()

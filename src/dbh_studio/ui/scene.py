@@ -1,0 +1,279 @@
+"""What one browser tab sees in 3D. It only shows: nothing here decides or computes a measurement.
+
+Two rules come from measuring viser 1.1.1: the big cloud is sent once and never recoloured (a new colour sends every
+position again and draws over the trunks), and a colour mode is a visibility switch on a parent node.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any, Literal, get_args
+
+import numpy as np
+import viser
+
+from dbh_studio.core.arrays import Float32, Float64
+from dbh_studio.core.display import HIGHLIGHT_YELLOW, TRUNK_RED, coarse_first_chunks, thin_to, tree_colour
+from dbh_studio.core.trunks import Trunk
+from dbh_studio.ui.display_cloud import DisplayCloud
+
+log = logging.getLogger(__name__)
+
+ColourMode = Literal["Original", "Segmentation (red)", "Segmentation (by tree)", "Height"]
+COLOUR_MODES: tuple[ColourMode, ...] = get_args(ColourMode)
+
+_OVERLAY_BUDGET = 1_200_000
+_PER_TREE = 25_000
+
+
+class SceneView:
+    """The 3D side of one tab."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        self._client = client
+        self._scene = client.scene
+        self._display: DisplayCloud | None = None
+        self._mode: ColourMode = "Original"
+        self._labels_on = True
+        self._crowns_on = True
+        self._point_size = 0.02
+        self._clouds: list[Any] = []
+        self._overlays: dict[int, tuple[Trunk, Any, Any]] = {}
+        self._label_handles: dict[int, Any] = {}
+        self._highlight: list[Any] = []
+        self._frames: dict[str, Any] = {}
+        self._stream_stop = threading.Event()
+        self._lock = threading.RLock()
+
+    # ---- the cloud
+
+    def show_plot(self, display: DisplayCloud) -> None:
+        """Replace everything by this plot and look at it; the points arrive coarse first, in the background."""
+        self.clear()
+        self._display = display
+        self._point_size = display.point_size
+        for name in (
+            "/rgb",
+            "/rgb/low",
+            "/rgb/crown",
+            "/height",
+            "/height/low",
+            "/height/crown",
+            "/red",
+            "/tree",
+            "/labels",
+        ):
+            self._frames[name] = self._scene.add_frame(name, show_axes=False)
+        self._apply_visibility()
+        self.look_at_plot(animate=False)
+        self._stream_stop = threading.Event()
+        threading.Thread(target=self._stream, args=(display, self._stream_stop), daemon=True, name="stream").start()
+
+    def clear(self) -> None:
+        """Remove the plot from the picture."""
+        self._stream_stop.set()
+        with self._lock:
+            self.highlight(None, None)
+            for handle in self._frames.values():
+                if handle.name.count("/") == 1:
+                    handle.remove()
+            self._frames, self._clouds, self._overlays, self._label_handles = {}, [], {}, {}
+            self._display = None
+
+    def stop(self) -> None:
+        """Stop sending: the tab is gone."""
+        self._stream_stop.set()
+
+    def _stream(self, display: DisplayCloud, stop: threading.Event) -> None:
+        """Send the cloud in growing chunks; runs on its own thread until done, replaced, or the tab is gone."""
+        order = [("/rgb", display.rgb), ("/height", display.by_height)]
+        for parent, colours in order if display.has_rgb else order[:1]:
+            for part, is_part in (("low", ~display.is_crown), ("crown", display.is_crown)):
+                chosen = np.flatnonzero(is_part)
+                for number, chunk in enumerate(coarse_first_chunks(len(chosen))):
+                    rows = chosen[chunk]
+                    with self._lock:
+                        if stop.is_set():
+                            return
+                        self._clouds.append(
+                            self._add_points(
+                                f"{parent}/{part}/{number}", display.points[rows], colours[rows], self._point_size
+                            )
+                        )
+                    self._client.flush()
+                    # Room for clicks and text between two chunks on a slow line.
+                    time.sleep(0.03)
+
+    def _add_points(self, name: str, points: Float32, colours: Any, size: float, *, visible: bool = True) -> Any:
+        return self._scene.add_point_cloud(
+            name,
+            points=points,
+            colors=colours,
+            point_size=size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+            visible=visible,
+        )
+
+    # ---- trunks
+
+    def show_trunks(self, trunks: dict[int, tuple[Trunk, Float32, Float64, str]]) -> None:
+        """Bring the overlays in step with the given trunks; unchanged ones are left alone.
+
+        Args:
+            trunks: For each id: the trunk, its points (world), where its label goes (world), and the label's text.
+        """
+        with self._lock, self._client.atomic():
+            for trunk_id in set(self._overlays) - set(trunks):
+                self._remove_trunk(trunk_id)
+            limit = min(_PER_TREE, _OVERLAY_BUDGET // max(len(trunks), 1))
+            for trunk_id, (trunk, points, anchor, text) in trunks.items():
+                known = self._overlays.get(trunk_id)
+                if known is None or known[0] is not trunk:
+                    self._remove_trunk(trunk_id)
+                    shown = thin_to(points, limit)
+                    size = 1.25 * self._point_size
+                    red = self._add_points(f"/red/{trunk_id}", shown, TRUNK_RED, size)
+                    own = self._add_points(f"/tree/{trunk_id}", shown, tree_colour(trunk_id), size)
+                    self._overlays[trunk_id] = (trunk, red, own)
+                self._set_label(trunk_id, anchor, text)
+
+    def _set_label(self, trunk_id: int, anchor: Float64, text: str) -> None:
+        label = self._label_handles.get(trunk_id)
+        if label is None:
+            self._label_handles[trunk_id] = self._scene.add_label(
+                f"/labels/{trunk_id}", text, position=tuple(anchor), anchor="bottom-center", font_screen_scale=0.85
+            )
+        else:
+            if label.text != text:
+                label.text = text
+            label.position = tuple(anchor)
+
+    def _remove_trunk(self, trunk_id: int) -> None:
+        known = self._overlays.pop(trunk_id, None)
+        if known is not None:
+            known[1].remove()
+            known[2].remove()
+        label = self._label_handles.pop(trunk_id, None)
+        if label is not None:
+            label.remove()
+
+    def highlight(self, points: Float32 | None, ring: Float32 | None) -> None:
+        """Draw one trunk in yellow with its measured ring, or nothing."""
+        with self._lock:
+            for handle in self._highlight:
+                handle.remove()
+            self._highlight = []
+            if points is not None and len(points):
+                shown = thin_to(points, 2 * _PER_TREE)
+                self._highlight.append(self._add_points("/highlight", shown, HIGHLIGHT_YELLOW, 1.3 * self._point_size))
+            if ring is not None and len(ring) > 2:
+                segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)
+                self._highlight.append(
+                    self._scene.add_line_segments(
+                        "/ring", segments, (230, 60, 0), thickness=4.0, thickness_units="screen"
+                    )
+                )
+
+    # ---- how it looks
+
+    def set_mode(self, mode: ColourMode) -> None:
+        """Switch the colours: visibility messages only, whatever the size of the cloud."""
+        self._mode = mode
+        self._apply_visibility()
+
+    def set_labels(self, on: bool) -> None:
+        """Show or hide the tree numbers."""
+        self._labels_on = on
+        self._apply_visibility()
+
+    def set_crowns(self, on: bool) -> None:
+        """Show or hide what is higher than the stems' lower part."""
+        self._crowns_on = on
+        self._apply_visibility()
+
+    def _apply_visibility(self) -> None:
+        if not self._frames or self._display is None:
+            return
+        by_height = self._mode == "Height" and self._display.has_rgb
+        wanted = {
+            "/rgb": not by_height,
+            "/height": by_height,
+            "/rgb/crown": self._crowns_on,
+            "/height/crown": self._crowns_on,
+            "/red": self._mode == "Segmentation (red)",
+            "/tree": self._mode == "Segmentation (by tree)",
+            "/labels": self._labels_on,
+        }
+        with self._client.atomic():
+            for name, visible in wanted.items():
+                if self._frames[name].visible != visible:
+                    self._frames[name].visible = visible
+
+    def set_point_size(self, factor: float) -> None:
+        """Scale all points by a factor of the size that fits the cloud's spacing."""
+        if self._display is None:
+            return
+        with self._lock, self._client.atomic():
+            self._point_size = self._display.point_size * factor
+            for handle in self._clouds:
+                handle.point_size = self._point_size
+            for _, red, own in self._overlays.values():
+                red.point_size = own.point_size = 1.25 * self._point_size
+
+    # ---- the camera
+
+    def look_at_plot(self, *, animate: bool = True) -> None:
+        """From just outside the plot, a little above the heads: stems are seen, not crowns."""
+        if self._display is None:
+            return
+        centre, radius = self._display.centre_and_radius()
+        self._move(centre + radius * np.array([0.15, -1.55, 0.42]), centre, animate=animate)
+
+    def look_from_top(self) -> None:
+        """Straight down, north up."""
+        if self._display is None:
+            return
+        centre, radius = self._display.centre_and_radius()
+        self._move(centre + np.array([0.0, -1e-3, 2.4 * radius + 8.0]), centre, up=(0.0, 1.0, 0.0))
+
+    def look_from_side(self) -> None:
+        """Level, from the south, at stem height."""
+        if self._display is None:
+            return
+        centre, radius = self._display.centre_and_radius()
+        self._move(centre + np.array([0.0, -2.0 * radius, 0.05 * radius]), centre)
+
+    def fly_to(self, target: Float64, *, distance: float = 4.5) -> None:
+        """Stand in front of a point, on the side one is looking from."""
+        away = np.asarray(self._client.camera.position, float) - target
+        away[2] = 0.0
+        norm = float(np.linalg.norm(away))
+        away = away / norm if norm > 1e-6 else np.array([0.0, -1.0, 0.0])
+        self._move(target + distance * away + np.array([0.0, 0.0, 0.2 * distance]), target)
+
+    def _move(
+        self,
+        position: Float64,
+        look_at: Float64,
+        *,
+        up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+        animate: bool = True,
+    ) -> None:
+        camera = self._client.camera
+        start, start_look = np.asarray(camera.position, float), np.asarray(camera.look_at, float)
+        n_steps = 8 if animate else 1
+        camera.up_direction = up
+        for step in range(1, n_steps + 1):
+            eased = step / n_steps
+            eased = eased * eased * (3 - 2 * eased)
+            with self._client.atomic():
+                # Setting the position moves look_at along, so the order matters.
+                camera.position = start + (position - start) * eased
+                camera.look_at = start_look + (look_at - start_look) * eased
+            self._client.flush()
+            if step < n_steps:
+                time.sleep(1 / 25)

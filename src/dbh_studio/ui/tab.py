@@ -1,0 +1,364 @@
+"""One browser tab: its panel, its picture, its selection. What it does is a command to the session or a view change."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+import viser
+
+from dbh_studio.app.session import Change, Session
+from dbh_studio.core.arrays import Float32, Float64
+from dbh_studio.core.dbh import CurveFit, DbhEstimate
+from dbh_studio.errors import StudioError
+from dbh_studio.settings import Settings
+from dbh_studio.ui import html
+from dbh_studio.ui.bind import SceneClick, TabWorker
+from dbh_studio.ui.bridge import Bridge
+from dbh_studio.ui.panels.base import Panel, set_content, set_value
+from dbh_studio.ui.panels.export import ExportPanel
+from dbh_studio.ui.panels.inspect import InspectPanel, row_of
+from dbh_studio.ui.panels.open import OpenPanel
+from dbh_studio.ui.panels.scale import ScalePanel
+from dbh_studio.ui.panels.trunks import TrunksPanel
+from dbh_studio.ui.scene import COLOUR_MODES, ColourMode, SceneView
+from dbh_studio.ui.steps import PlotStatus, StepName
+from dbh_studio.ui.view_state import ViewState
+
+if TYPE_CHECKING:
+    from dbh_studio.ui.studio import JobState, Studio
+
+log = logging.getLogger(__name__)
+
+# How much of what lies under the cursor must belong to one trunk for the click to mean that trunk.
+_MIN_SHARE = 0.2
+
+
+class Tab:
+    """Builds the panel of one client and keeps it in step with the plot."""
+
+    def __init__(self, studio: Studio, worker: TabWorker) -> None:
+        self.studio = studio
+        self.worker = worker
+        self.client = worker.client
+        self.bridge = Bridge(worker)
+        self.scene = SceneView(self.client)
+        self.view = ViewState()
+        self._build()
+        self.bridge.on("step", self._step_chosen)
+        self.bridge.on("row", self._row_chosen)
+        self.bridge.on("sort", self._sort_chosen)
+        self.bridge.on("undo", lambda _: self._undo_pressed())
+        self.bridge.on("redo", lambda _: self._redo_pressed())
+        worker.on_scene_click(self.client, self._scene_clicked)
+        worker.on_close(self.scene.stop)
+        self.adopt_session()
+
+    # ---- building
+
+    def _build(self) -> None:
+        gui = self.client.gui
+        self.bridge.run(html.style_js())
+        self._header = gui.add_html("")
+        self._job_text = gui.add_html("", visible=False)
+        self._job_bar = gui.add_progress_bar(0.0, visible=False, color="green")
+        self._cancel = gui.add_button("Cancel", color="red", icon=viser.Icon.X, visible=False)
+        self.worker.on_cancel(self._cancel, self.studio.cancel_job)
+        self.panels: tuple[Panel, ...] = tuple(
+            panel(self) for panel in (OpenPanel, ScalePanel, TrunksPanel, InspectPanel, ExportPanel)
+        )
+        self._build_view_controls()
+        self._add_commands()
+
+    def _build_view_controls(self) -> None:
+        gui, worker = self.client.gui, self.worker
+        with gui.add_folder("View"):
+            self._mode = gui.add_dropdown("Colours", COLOUR_MODES)
+            worker.on_update(self._mode, self._mode_chosen)
+            self._views = gui.add_button_group("Look", ("Plot", "Top", "Side", "Tree"))
+            worker.on_update(self._views, self._view_chosen)
+            self._labels = gui.add_checkbox("Tree numbers", True)
+            worker.on_update(self._labels, self.scene.set_labels)
+            self._crowns = gui.add_checkbox("Crowns", False, hint="points more than 6 m above the ground")
+            worker.on_update(self._crowns, self.scene.set_crowns)
+            self._size = gui.add_slider("Point size", 0.3, 3.0, 0.1, 1.0)
+            worker.on_update(self._size, self.scene.set_point_size, coalesce=True)
+
+    def _add_commands(self) -> None:
+        # W A S D Q E and the arrow keys already move the camera.
+        for label, key, modifier, action in (
+            ("Undo", "Z", "cmd/ctrl", self._undo_pressed),
+            ("Redo", "Z", "cmd/ctrl+shift", self._redo_pressed),
+            ("Next tree", "N", None, lambda: self._step_tree(1)),
+            ("Previous tree", "P", None, lambda: self._step_tree(-1)),
+            ("Fly to the tree", "F", None, self._fly_to_selected),
+            ("Look from the top", "T", None, self.scene.look_from_top),
+            ("Whole plot", "H", None, self.scene.look_at_plot),
+        ):
+            self.worker.add_command(label, action, hotkey=key, modifier=modifier)
+
+    # ---- the plot
+
+    @property
+    def session(self) -> Session | None:
+        """The open plot, if any."""
+        return self.studio.session
+
+    def require_session(self) -> Session:
+        """The open plot; StudioError where none is open."""
+        if self.studio.session is None:
+            raise StudioError("No plot is open.", "Open one in step 1.")
+        return self.studio.session
+
+    def settings(self) -> Settings:
+        """The plot's settings, or the defaults."""
+        return self.session.document.settings if self.session is not None else Settings()
+
+    def adopt_session(self) -> None:
+        """Show the plot that is open now from scratch: on connect, and after another one was opened."""
+        self.view.selected, self.view.n_inspected = None, 0
+        self.view.step = self.status().next_step()
+        self.refresh()
+        self.client.flush()
+        self.show_cloud()
+
+    def show_cloud(self) -> None:
+        """Send the cloud as it is now turned and scaled."""
+        display = self.studio.display
+        if display is None:
+            self.scene.clear()
+            return
+        self.scene.show_plot(display)
+        self.scene.set_crowns(bool(self._crowns.value))
+        self.refresh_trunks()
+
+    def session_changed(self, change: Change) -> None:
+        """Follow one change of the document."""
+        if self.view.selected is not None and self.view.selected not in change.after.trunks:
+            self.view.selected = None
+        frame_moved = (
+            change.before.scale != change.after.scale or change.before.up_direction != change.after.up_direction
+        )
+        self.refresh()
+        self.client.flush()
+        if frame_moved:
+            self.show_cloud()
+        elif change.before is not change.after:
+            self.refresh_trunks()
+        if change.before.trunks is not change.after.trunks and len(change.before.trunks) == 0:
+            self._trunks_appeared()
+
+    def _trunks_appeared(self) -> None:
+        """The first trunks of a plot: show them in red and go on to the next step."""
+        if self.view.mode == "Original":
+            set_value(self._mode, "Segmentation (red)")
+            self._mode_chosen("Segmentation (red)")
+        self.go_to_next_step()
+
+    def status(self) -> PlotStatus:
+        """What is done of this plot."""
+        session = self.session
+        if session is None:
+            return PlotStatus()
+        document = session.document
+        waiting = set(session.unmeasured())
+        measured = [i for i in document.trunks.ids if i not in waiting and session.measurement(i).result]
+        return PlotStatus(
+            has_plot=True,
+            is_scaled=document.scale.is_known,
+            n_trunks=len(document.trunks),
+            n_measured=len(measured),
+            n_waiting=len(waiting),
+            n_inspected=self.view.n_inspected,
+            is_exported=self.studio.is_exported(),
+        )
+
+    # ---- showing
+
+    def refresh(self) -> None:
+        """Bring header, active panel and buttons in step."""
+        with self.client.atomic():
+            self.refresh_header()
+            for panel in self.panels:
+                is_active = panel.step == self.view.step
+                if is_active:
+                    panel.refresh()
+                panel.show(is_active)
+
+    def refresh_header(self) -> None:
+        """Plot name, steps, hint."""
+        session = self.session
+        content = html.header(
+            session.document.plot_id if session is not None else "",
+            self.status(),
+            self.view.step,
+            saved=self.studio.saved_text(),
+            undo=session.undo_label if session is not None else "",
+            redo=session.redo_label if session is not None else "",
+        )
+        set_content(self._header, content)
+
+    def refresh_trunks(self) -> None:
+        """Bring the trunk overlays, labels and the highlight in step."""
+        session = self.session
+        if session is None or self.studio.display is None:
+            return
+        points_world = session.points_world()
+        shown = {}
+        for trunk in session.document.trunks:
+            points = points_world[trunk.points]
+            shown[trunk.id] = (trunk, points, _label_anchor(points), str(trunk.id))
+        self.scene.show_trunks(shown)
+        self._refresh_highlight()
+
+    def _refresh_highlight(self) -> None:
+        session, selected = self.session, self.view.selected
+        if session is None or selected is None:
+            self.scene.highlight(None, None)
+            return
+        points = session.points_world()[session.document.trunks[selected].points]
+        self.scene.highlight(points, self._ring_world(selected))
+
+    def _ring_world(self, trunk_id: int) -> Float32 | None:
+        """(M, 3) outline of the measured curve in the world frame."""
+        stem = self.require_session().measurement(trunk_id)
+        if not isinstance(stem.result, DbhEstimate):
+            return None
+        fit = stem.result.fits[stem.result.curve]
+        if not isinstance(fit, CurveFit):
+            return None
+        # A little outside the bark, or the trunk's own points would hide it.
+        centre = fit.outline_uv_m.mean(axis=0)
+        outline = centre + (fit.outline_uv_m - centre) * (1.0 + 0.06 / fit.diameter_m("curve"))
+        flat = np.column_stack([outline, np.zeros(len(outline))])
+        ring = stem.result.section.stem_from_section.apply(flat)
+        return (ring + np.array([0.0, 0.0, stem.z_ground_m])).astype(np.float32)
+
+    def show_job(self, job: JobState | None) -> None:
+        """Show the running job, or that none runs."""
+        running = job is not None
+        with self.client.atomic():
+            if job is not None:
+                set_content(self._job_text, html.message(f"{job.title}: {job.message}" if job.message else job.title))
+                set_value(self._job_bar, 100.0 * job.fraction)
+            for handle in (self._job_text, self._job_bar, self._cancel):
+                if handle.visible != running:
+                    handle.visible = running
+        self.client.flush()
+
+    def table_rows(self) -> list[html.TableRow]:
+        """One row per trunk that has been measured."""
+        session = self.session
+        if session is None:
+            return []
+        document, waiting = session.document, set(session.unmeasured())
+        rows = []
+        for trunk_id in document.trunks.ids:
+            record = document.record(trunk_id)
+            if trunk_id in waiting:
+                rows.append(html.TableRow(trunk_id, None, "", None, "being measured …"))
+            else:
+                result = session.measurement(trunk_id).result
+                rows.append(row_of(trunk_id, result, species=record.species, note=record.note))
+        return rows
+
+    # ---- what a person does
+
+    def go_to_next_step(self) -> None:
+        """Show the first step that is not done."""
+        self.view.step = self.status().next_step()
+        self.refresh()
+
+    def select(self, trunk_id: int | None, *, fly: bool = False) -> None:
+        """Choose a tree: text first, then the row, then the picture."""
+        self.view.selected = trunk_id
+        if trunk_id is not None:
+            self.view.n_inspected += 1
+            self.view.step = "inspect"
+        self.refresh()
+        self.client.flush()
+        self._refresh_highlight()
+        if fly and trunk_id is not None:
+            self._fly_to_selected()
+
+    def _scene_clicked(self, click: SceneClick) -> None:
+        session, display = self.session, self.studio.display
+        if session is None or display is None:
+            return
+        hit = display.picking.pick(click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
+        if hit is None:
+            return
+        labels = self.studio.display_labels()[hit.surface]
+        ids, counts = np.unique(labels[labels > 0], return_counts=True)
+        if len(ids) and counts.max() >= _MIN_SHARE * len(labels):
+            self.select(int(ids[counts.argmax()]))
+        elif self.view.selected is not None:
+            self.select(None)
+
+    def _step_chosen(self, payload: Any) -> None:
+        if payload in get_args(StepName):
+            self.view.step = payload
+            self.refresh()
+
+    def _row_chosen(self, payload: Any) -> None:
+        session = self.session
+        if session is not None and isinstance(payload, int) and payload in session.document.trunks:
+            self.select(payload, fly=True)
+
+    def _sort_chosen(self, payload: Any) -> None:
+        if payload not in {column[0] for column in html.TABLE_COLUMNS}:
+            return
+        if payload == self.view.sort_column:
+            self.view.sort_descending = not self.view.sort_descending
+        else:
+            self.view.sort_column, self.view.sort_descending = payload, False
+        self.refresh()
+
+    def _step_tree(self, step: int) -> None:
+        ids = self.session.document.trunks.ids if self.session is not None else ()
+        if not ids:
+            return
+        at = ids.index(self.view.selected) + step if self.view.selected in ids else (0 if step > 0 else -1)
+        self.select(ids[at % len(ids)], fly=True)
+
+    def _fly_to_selected(self) -> None:
+        session, selected = self.session, self.view.selected
+        if session is None or selected is None:
+            return
+        stem = session.measurement(selected)
+        if isinstance(stem.result, DbhEstimate):
+            target = np.array([*stem.xy_m, stem.z_ground_m + stem.result.section.hom_m])
+        else:
+            target = np.median(session.points_world()[session.document.trunks[selected].points], axis=0).astype(float)
+        self.scene.fly_to(target)
+
+    def _mode_chosen(self, mode: ColourMode) -> None:
+        self.view.mode = mode
+        self.scene.set_mode(mode)
+
+    def _view_chosen(self, choice: str) -> None:
+        actions = {
+            "Plot": self.scene.look_at_plot,
+            "Top": self.scene.look_from_top,
+            "Side": self.scene.look_from_side,
+            "Tree": self._fly_to_selected,
+        }
+        actions[choice]()
+
+    def _undo_pressed(self) -> None:
+        self.require_session().undo()
+
+    def _redo_pressed(self) -> None:
+        self.require_session().redo()
+
+
+def _label_anchor(points: Float32) -> Float64:
+    """Where a trunk's number stands: above the middle of its lower two metres."""
+    if len(points) == 0:
+        return np.zeros(3)
+    base = float(np.percentile(points[:, 2], 2))
+    low = points[points[:, 2] < base + 2.0]
+    centre = np.median(low if len(low) else points, axis=0).astype(np.float64)
+    centre[2] = base + 2.3
+    return centre

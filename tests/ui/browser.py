@@ -1,0 +1,104 @@
+"""Helpers for tests in a real Chromium, drawing in software.
+
+Software drawing takes about 2 s per frame and million points: keep clouds in browser tests below 100 000 points, and
+start the browser once per test file::
+
+    @pytest.fixture(scope="module")
+    def chromium(chromium_path):                # skips where there is no browser
+        with browser.chromium(chromium_path) as running:
+            yield running
+
+    page = browser.open_page(chromium, server.url)
+    browser.wait_for_points(page, 60_000)
+    page.mouse.click(*browser.pixel_of(page, (0, 0, 1.3)))
+    assert browser.page_errors(page) == []
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import pytest
+
+LAUNCH_ARGUMENTS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+TIMEOUT_MS = 60_000
+
+_PIXEL = """point => {
+  const m = window.__viserMutable, camera = m.camera, box = m.canvas.getBoundingClientRect();
+  camera.updateMatrixWorld();
+  const v = new camera.position.constructor(...point);
+  m.nodeRefFromName[''].localToWorld(v);
+  v.project(camera);
+  return [box.x + (v.x + 1) / 2 * box.width, box.y + (1 - v.y) / 2 * box.height];
+}"""
+
+
+@contextlib.contextmanager
+def chromium(executable: str) -> Iterator[Any]:
+    """A running Playwright browser; `executable` comes from the fixture `chromium_path`."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+    with sync_api.sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=executable, args=list(LAUNCH_ARGUMENTS))
+        try:
+            yield running
+        finally:
+            running.close()
+
+
+def open_page(browser: Any, url: str, *, size: tuple[int, int] = (1100, 700), wait: bool = True) -> Any:
+    """Open `url` in a profile of its own (no cookies) and, with `wait`, wait until the page talks to the server.
+
+    Errors of the page are collected for `page_errors`.
+    """
+    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
+    page = context.new_page()
+    page.set_default_timeout(TIMEOUT_MS)
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.studio_errors = errors
+    page.goto(url)
+    if wait:
+        page.wait_for_function("() => window.__viserMutable && window.__viserMutable.cameraControl")
+    return page
+
+
+def page_errors(page: Any) -> list[str]:
+    """Uncaught exceptions and console errors since the page was opened; refusals by the content policy among them."""
+    return list(page.studio_errors)
+
+
+def wait_for_points(page: Any, n_points: int) -> None:
+    """Wait until a frame with at least so many points was drawn."""
+    page.wait_for_function("n => window.__viserTestpoints.rendererInfo.render.points >= n", arg=n_points)
+
+
+def pixel_of(page: Any, point: Sequence[float]) -> tuple[float, float]:
+    """Where a world point is on the page, in CSS pixels."""
+    x, y = page.evaluate(_PIXEL, [float(c) for c in point])
+    return float(x), float(y)
+
+
+def close_notifications(page: Any) -> None:
+    """Close what covers the upper left corner (the page warns of software drawing there)."""
+    page.evaluate("() => document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
+    page.wait_for_timeout(400)  # they fade
+
+
+def handle_selector(handle: Any) -> str:
+    """CSS selector of a viser input: the page uses the handle's uuid as the element's id."""
+    return f"[id='{handle._impl.uuid}']"

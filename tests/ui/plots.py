@@ -1,0 +1,69 @@
+"""A small plot with known trees for the studio's tests, made once per run of the tests."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from dbh_studio.app.commands import replace_trunks
+from dbh_studio.app.opening import open_plot
+from dbh_studio.app.pipeline import segment_plot
+from dbh_studio.app.session import Session
+from dbh_studio.core.cloud import PointCloud
+from dbh_studio.core.ground import GroundModel
+from dbh_studio.core.synthetic import PlotRecipe, SyntheticPlot, make_plot
+from dbh_studio.core.trunks import TrunkSet
+from dbh_studio.io.las import write_las
+from dbh_studio.io.ply import write_ply
+from dbh_studio.settings import Settings
+from dbh_studio.stages.measure import StemMeasurement
+
+
+@functools.cache
+def plot() -> SyntheticPlot:
+    """Five stems on gently sloping ground, 80 000 points."""
+    return make_plot(PlotRecipe.simple(points=80_000, seed=7))
+
+
+def write_laz(folder: Path, name: str = "plot.laz") -> Path:
+    """The plot as a LAZ file, in metres."""
+    path = folder / name
+    write_las(path, plot().cloud)
+    return path
+
+
+@functools.cache
+def _found() -> tuple[GroundModel, TrunkSet, tuple[str, ...]]:
+    return segment_plot(plot().cloud.xyz, Settings())
+
+
+def measured_session(folder: Path) -> Session:
+    """The plot opened from a file, with its trunks found and measured; the work is done once per run of the tests."""
+    session = open_plot(write_laz(folder), project_dir=folder / "plot.dbh")
+    ground, trunks, _ = _found()
+    session.remember_ground(session.document, ground)
+    session.do(replace_trunks(trunks))
+    document = session.document
+    if not _measurements:
+        _measurements.extend(session.measurements())
+    session.remember_measurements(document, _measurements)
+    return session
+
+
+_measurements: list[StemMeasurement] = []
+
+
+def write_unscaled_ply(folder: Path, *, metres_per_unit: float = 1.7) -> Path:
+    """The plot as a photogrammetric PLY in an arbitrary unit."""
+    cloud = plot().cloud
+    path = folder / "unscaled.ply"
+    scaled = PointCloud((cloud.xyz / metres_per_unit).astype(np.float32), np.zeros(3), cloud.rgb)
+    write_ply(path, scaled)
+    return path
+
+
+def true_diameters_cm() -> np.ndarray:
+    """Perimeter / π of the plot's stems in the middle of the measured band, ascending."""
+    return np.sort([tree.diameter_cm("curve", height_m=1.37) for tree in plot().trees])

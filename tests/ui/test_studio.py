@@ -1,0 +1,376 @@
+"""The studio as a person uses it, over the real websocket, without a browser."""
+
+import csv
+import io
+import time
+
+import numpy as np
+import plots
+import pytest
+from fakeclient import FakeClient
+
+from dbh_studio.app.opening import open_plot
+from dbh_studio.ui.server import start_server
+from dbh_studio.ui.studio import Studio
+
+LONG = 60.0
+
+
+@pytest.fixture
+def studio(tmp_path):
+    running = Studio(start_server(port=0), uploads_folder=tmp_path / "uploads")
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def tab(studio):
+    with FakeClient(studio.server.url) as client:
+        yield client
+
+
+@pytest.fixture
+def plot_path(tmp_path):
+    return plots.write_laz(tmp_path)
+
+
+def open_by_path(tab, path):
+    tab.wait_text("Open a point cloud")
+    tab.set("File or folder", str(path))
+    tab.press("Open")
+    tab.wait(lambda t: path.stem in t.text() and t.has("Find trunks"), LONG)
+
+
+def find_trunks(tab, studio):
+    tab.press("Find trunks")
+    tab.wait_text("trunks found", LONG)
+    assert studio.wait_idle(LONG)
+    tab.wait(lambda t: "being measured" not in t.text(), LONG)
+
+
+@pytest.fixture
+def measured(studio, tmp_path):
+    """A tab that shows a plot whose trunks are found and measured."""
+    studio.adopt(plots.measured_session(tmp_path))
+    with FakeClient(studio.server.url) as client:
+        client.wait(table_ids, LONG)
+        client.wait(lambda t: "/labels" in t.scene, LONG)
+        yield client
+
+
+def table_ids(tab):
+    return [int(row.split('"')[0]) for row in tab.html().split('<tr data-id="')[1:]]
+
+
+def test_from_an_empty_studio_to_the_inventory(tab, studio, plot_path):
+    measured = tab
+    open_by_path(tab, plot_path)
+    find_trunks(tab, studio)
+    ids = table_ids(tab)
+    assert len(ids) == len(plots.plot().trees)
+    measured.bridge_send("row", ids[0])
+    measured.wait_text(f"Tree {ids[0]}")
+    measured.wait_text("cm DBH")
+    measured.bridge_send("step", "export")
+    measured.press("Download the inventory (CSV)")
+    measured.wait(lambda t: t.downloads, LONG)
+    ((name, content),) = measured.downloads.items()
+    assert name == "plot_inventory.csv"
+    rows = list(csv.DictReader(io.StringIO(content.decode())))
+    assert sorted(float(row["dbh_cm"]) for row in rows) == pytest.approx(plots.true_diameters_cm(), rel=0.04)
+    measured.wait_text("The inventory has been exported")
+
+
+def test_the_number_on_the_card_is_the_number_in_the_session(measured, studio):
+    trunk_id = table_ids(measured)[0]
+    measured.bridge_send("row", trunk_id)
+    measured.wait_text(f"Tree {trunk_id}")
+    expected = studio.session.measurement(trunk_id).result.dbh_cm
+    measured.wait(lambda t: f'data-dbh="{expected:.1f}"' in t.html())
+
+
+def test_clicking_each_trunk_in_the_scene_selects_it(measured, studio):
+    points = studio.session.points_world()
+    for trunk in studio.session.document.trunks:
+        stem = points[trunk.points]
+        middle = np.median(stem[np.abs(stem[:, 2] - np.median(stem[:, 2])) < 0.5], axis=0).astype(float)
+        measured.look(middle + np.array([2.5, -1.0, 0.3]), middle)
+        measured.click_scene(middle)
+        measured.wait_text(f"Tree {trunk.id}")
+        measured.wait(lambda t: "/highlight" in t.scene)
+
+
+def test_clicking_the_ground_selects_nothing(measured, studio):
+    trunk_id = table_ids(measured)[0]
+    measured.bridge_send("row", trunk_id)
+    measured.wait_text(f"Tree {trunk_id}")
+    display = studio.display
+    ground = display.points[np.argmin(display.points[:, 2])].astype(float)
+    measured.look(ground + np.array([0.5, 0.5, 6.0]), ground)
+    measured.click_scene(ground)
+    measured.wait(lambda t: "/highlight" not in t.scene)
+
+
+def test_undo_and_redo_of_a_deleted_trunk(measured, studio):
+    ids = table_ids(measured)
+    measured.bridge_send("row", ids[1])
+    measured.wait_text(f"Tree {ids[1]}")
+    measured.press("Delete this trunk")
+    measured.wait(lambda t: table_ids(t) == [i for i in ids if i != ids[1]] and f"/red/{ids[1]}" not in t.scene)
+    measured.bridge_send("undo")
+    measured.wait(lambda t: table_ids(t) == ids and f"/red/{ids[1]}" in t.scene)
+    measured.command("Redo")
+    measured.wait(lambda t: ids[1] not in table_ids(t))
+
+
+def test_a_double_click_on_find_trunks_runs_once(tab, studio, plot_path):
+    open_by_path(tab, plot_path)
+    tab.press("Find trunks")
+    tab.press("Find trunks")
+    tab.wait_text("trunks found", LONG)
+    assert studio.wait_idle(LONG)
+    assert studio.session.undo_label.startswith("Find")
+    studio.session.undo()
+    assert not studio.session.can_undo
+
+
+def test_cancel_leaves_the_plot_as_it_was(tab, studio, plot_path):
+    open_by_path(tab, plot_path)
+    before = studio.session.document
+    tab.press("Find trunks")
+    tab.wait(lambda t: "Finding trunks" in t.text() and t.has("Cancel"))
+    tab.press("Cancel")
+    tab.wait_notification("Cancelled", LONG)
+    tab.wait(lambda t: not t.has("Cancel"))
+    assert studio.session.document is before
+    # And it can be started again.
+    find_trunks(tab, studio)
+
+
+def test_an_unscaled_cloud_is_not_measured_until_it_has_a_scale(tab, studio, tmp_path):
+    path = plots.write_unscaled_ply(tmp_path, metres_per_unit=1.7)
+    tab.wait_text("Open a point cloud")
+    tab.set("File or folder", str(path))
+    tab.press("Open")
+    tab.wait_text("This cloud has no scale yet", LONG)
+    tab.bridge_send("step", "trunks")
+    tab.press("Find trunks")
+    tab.wait_notification("no scale")
+    assert len(studio.session.document.trunks) == 0
+    tab.bridge_send("step", "scale")
+    tab.set("One unit of the file is", "another unit")
+    tab.set("Metres per unit", 1.7)
+    tab.press("Set scale")
+    tab.wait(lambda t: t.has("Find trunks"))
+    find_trunks(tab, studio)
+    found = [row.dbh_cm for row in studio.session.inventory()]
+    assert np.sort(found) == pytest.approx(plots.true_diameters_cm(), rel=0.04)
+
+
+def test_changing_the_scale_afterwards_changes_the_diameters_and_keeps_the_trunks(measured, studio):
+    before = {row.stem_id: row.dbh_cm for row in studio.session.inventory()}
+    trunks = studio.session.document.trunks
+    measured.bridge_send("step", "scale")
+    measured.set("One unit of the file is", "another unit")
+    measured.set("Metres per unit", 1.02)
+    measured.press("Set scale")
+    measured.wait(lambda t: studio.session.document.scale.metres_per_unit == 1.02)
+    assert studio.wait_idle(LONG)
+    assert studio.session.document.trunks is trunks
+    after = {row.stem_id: row.dbh_cm for row in studio.session.inventory()}
+    # The band moves with the scale as well, so the taper adds a little.
+    assert all(after[i] == pytest.approx(1.02 * before[i], rel=0.03) for i in before)
+
+
+def test_choosing_another_curve_measures_again(measured, studio):
+    trunk_id = table_ids(measured)[0]
+    measured.bridge_send("row", trunk_id)
+    measured.wait_text("Fourier, perimeter")
+    measured.set("Curve", "ellipse")
+    measured.press("Measure again")
+    measured.wait_text("Ellipse, perimeter", LONG)
+    assert studio.session.measurement(trunk_id).result.curve == "ellipse"
+    measured.bridge_send("undo")
+    measured.wait_text("Fourier, perimeter", LONG)
+    measured.wait(lambda t: t.value("Curve") == "fourier")
+
+
+def test_colour_modes_switch_by_visibility_only(measured):
+    def shown():
+        return {name for name in ("/rgb", "/height", "/red", "/tree") if measured.scene[name].visible}
+
+    for mode, expected in (
+        ("Original", {"/rgb"}),
+        ("Segmentation (red)", {"/rgb", "/red"}),
+        ("Segmentation (by tree)", {"/rgb", "/tree"}),
+        ("Height", {"/height"}),
+    ):
+        measured.settle()
+        n_before = len(measured.messages)
+        measured.set("Colours", mode)
+        measured.wait(lambda _, expected=expected: shown() == expected)
+        measured.settle()
+        sent = {message["type"] for message in measured.messages[n_before:]}
+        assert not any("PointCloud" in kind for kind in sent)
+
+
+def test_the_cloud_arrives_coarse_first_and_within_the_budget(tmp_path, plot_path):
+    studio = Studio(start_server(port=0), uploads_folder=tmp_path, display_points=70_000)
+    try:
+        studio.adopt(open_plot(plot_path, project_dir=tmp_path / "x.dbh"))
+        with FakeClient(studio.server.url) as tab:
+
+            def sizes(t):
+                names = [n for n in t.scene if n.startswith("/rgb/") and n.rsplit("/", 1)[1].isdigit()]
+                return [len(t.scene[name].props["points"]) for name in names]
+
+            tab.wait(lambda t: sum(sizes(t)) == 70_000, LONG)
+            assert sizes(tab)[0] == 60_000
+    finally:
+        studio.close()
+
+
+def test_two_tabs_see_the_same_plot(measured, studio):
+    ids = table_ids(measured)
+    with FakeClient(studio.server.url) as other:
+        other.wait(lambda t: table_ids(t) == ids, LONG)
+        measured.bridge_send("row", ids[0])
+        measured.wait_text(f"Tree {ids[0]}")
+        measured.press("Delete this trunk")
+        other.wait(lambda t: table_ids(t) == ids[1:])
+        # Selection is each tab's own.
+        assert f"Tree {ids[0]}" not in other.text()
+
+
+def test_a_reload_shows_the_plot_again(measured, studio):
+    ids = table_ids(measured)
+    measured.close()
+    with FakeClient(studio.server.url) as again:
+        again.wait(lambda t: table_ids(t) == ids, LONG)
+
+
+def test_the_plot_is_saved_beside_its_source_and_opens_as_it_was(measured, studio, tmp_path):
+    ids = table_ids(measured)
+    measured.bridge_send("row", ids[0])
+    measured.wait_text(f"Tree {ids[0]}")
+    measured.wait(lambda t: t.has("Species"))
+    measured.set("Species", "Quercus alba")
+    measured.set("Status", "dead")
+    measured.press("Keep")
+    measured.wait(lambda t: studio.session.document.record(ids[0]).species == "Quercus alba")
+    expected = [(row.stem_id, row.dbh_cm, row.species, row.status) for row in studio.session.inventory()]
+    studio.close()
+    reopened = open_plot(tmp_path / "plot.dbh", read_only=True)
+    found = [(row.stem_id, pytest.approx(row.dbh_cm), row.species, row.status) for row in reopened.inventory()]
+    assert expected == found
+    assert ("Quercus alba", "dead") in [row[2:] for row in expected]
+
+
+def test_a_hostile_species_name_is_text(measured):
+    trunk_id = table_ids(measured)[0]
+    measured.bridge_send("row", trunk_id)
+    measured.wait_text(f"Tree {trunk_id}")
+    measured.wait(lambda t: t.has("Species"))
+    measured.set("Species", "<img src=x onerror=alert(1)>")
+    measured.press("Keep")
+    measured.wait(lambda t: "&lt;img" in t.html())
+    shown = [element.props.get("content") or "" for element in measured.elements.values()]
+    assert any("&lt;img" in content for content in shown)
+    assert not any("<img" in content for content in shown)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("empty.ply", b"", "empty"),
+        ("text.laz", b"x y z\n1 2 3\n", "text"),
+        ("broken.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 1000\nproperty float x\n"
+         b"property float y\nproperty float z\nend_header\n" + b"\0" * 24, ""),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_read_is_named_and_the_open_plot_stays(measured, studio, tmp_path, name, content, words):
+    path = tmp_path / name
+    path.write_bytes(content)
+    before = studio.session
+    measured.bridge_send("step", "open")
+    measured.set("File or folder", str(path))
+    measured.press("Open")
+    note = measured.wait_notification(name, LONG)
+    assert words in (note.title + note.body).lower()
+    assert studio.session is before
+    assert studio.wait_idle(LONG)
+    measured.bridge_send("step", "inspect")
+    measured.wait(table_ids)
+
+
+def test_a_path_that_does_not_exist(tab):
+    tab.wait_text("Open a point cloud")
+    tab.set("File or folder", "/no/such/file.laz")
+    tab.press("Open")
+    tab.wait_notification("no such file")
+    tab.set("File or folder", "   ")
+    tab.press("Open")
+    tab.wait_notification("No file was named")
+
+
+def test_upload_through_the_browser(tab, studio, tmp_path, plot_path):
+    tab.wait_text("Open a point cloud")
+    tab.upload("Upload a cloud", "mine.laz", plot_path.read_bytes())
+    tab.wait(lambda t: "mine" in t.text() and t.has("Find trunks"), LONG)
+    assert (tmp_path / "uploads" / "mine.laz").exists()
+    assert len(studio.session.cloud) == len(plots.plot().cloud)
+
+
+def test_the_number_is_shown_before_the_picture_turns(measured, studio):
+    """Text first: a slow graphics card must not delay what is read."""
+    trunk_id = table_ids(measured)[-1]
+    measured.settle()
+    n_before = len(measured.messages)
+    measured.bridge_send("row", trunk_id)
+    measured.wait(lambda t: "/highlight" in t.scene)
+    kinds = [
+        (i, message["type"], str(message.get("updates", ""))) for i, message in enumerate(measured.messages[n_before:])
+    ]
+    text = next(i for i, kind, updates in kinds if kind == "GuiUpdateMessage" and f"Tree {trunk_id}" in updates)
+    cloud = next(i for i, kind, _ in kinds if kind == "PointCloudMessage")
+    assert text < cloud
+
+
+def test_from_click_to_number_is_answered_from_memory(measured, studio, monkeypatch):
+    """After the background measurement no click measures anything."""
+    import dbh_studio.stages.measure as stage
+
+    def never(*_, **__):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(stage, "measure_trunk", never)
+    for trunk_id in table_ids(measured):
+        measured.bridge_send("row", trunk_id)
+        measured.wait_text(f"Tree {trunk_id}")
+
+
+def test_next_and_previous_tree_by_key(measured):
+    ids = table_ids(measured)
+    measured.command("Next tree")
+    measured.wait_text(f"Tree {ids[0]}")
+    measured.command("Previous tree")
+    measured.wait_text(f"Tree {ids[-1]}")
+
+
+def test_a_half_typed_setting_changes_nothing(measured, studio):
+    before = studio.session.document
+    measured.bridge_send("step", "trunks")
+    measured.set("Thinnest trunk (cm)", 20.0)
+    measured.settle()
+    assert studio.session.document is before
+
+
+def test_turning_a_y_up_cloud(tab, studio, plot_path):
+    open_by_path(tab, plot_path)
+    tab.bridge_send("step", "open")
+    tab.set("Up in the file", "+y")
+    tab.wait(lambda _: studio.session.document.up_direction == (0.0, 1.0, 0.0))
+    deadline = time.monotonic() + LONG
+    while not np.array_equal(studio.display.points, studio.session.points_world()[studio.display.indices]):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
