@@ -1,0 +1,89 @@
+"""The Python interface: open a plot, find the trunks, read the diameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from dbh_studio.app import opening, pipeline
+from dbh_studio.app.commands import change_settings
+from dbh_studio.app.document import Direction
+from dbh_studio.app.session import Session
+from dbh_studio.core.inventory import Inventory
+from dbh_studio.core.progress import Progress, ignore_progress
+from dbh_studio.core.scale import ScaleEstimate
+
+
+class Plot:
+    """One open plot; a context manager, which closes it.
+
+    Thin: everything is done by `session`, which may be used directly for commands, undo and listeners.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+
+    def __enter__(self) -> Plot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def settings(self, section: str, **values: Any) -> Plot:
+        """Change settings, such as ``plot.settings("measure", curve="ellipse")``; see ``dbh-studio settings``.
+
+        Raises:
+            CommandError: There is no such setting, or the value is outside its bounds.
+        """
+        self.session.do(change_settings(section, **values))
+        return self
+
+    def find_trunks(self, *, progress: Progress = ignore_progress) -> tuple[str, ...]:
+        """Find ground and trunks; returns notes in plain words.
+
+        Raises:
+            UnscaledCloudError: The plot has no scale yet.
+        """
+        return pipeline.segment(self.session, progress=progress, in_process=True)
+
+    def inventory(self, *, progress: Progress = ignore_progress) -> Inventory:
+        """One row per stem; measures what is not measured yet."""
+        return self.session.inventory(progress)
+
+    def write_csv(self, path: Path | str) -> Path:
+        """Write the inventory."""
+        from dbh_studio.io.inventory_csv import write_inventory_csv
+
+        return write_inventory_csv(Path(path), self.inventory())
+
+    def close(self) -> None:
+        """Save what is left and release the saved plot."""
+        self.session.close()
+
+
+def open_plot(
+    path: Path | str,
+    *,
+    scale: float | str | ScaleEstimate | None = None,
+    up: str | Direction | None = None,
+    project_dir: Path | str | None = None,
+    read_only: bool = False,
+    progress: Progress = ignore_progress,
+) -> Plot:
+    """Open a cloud, a mesh, a folder of them, or a saved ``NAME.dbh``.
+
+    Args:
+        path: What to open.
+        scale: Metres per unit, or ``metres``, ``feet``, ``millimetres``; None for what the data says.
+        up: ``+z``, ``+y``, … or a direction in the source; None for what the data says.
+        project_dir: Save every change there; without it nothing is written.
+        read_only: Refuse changes.
+        progress: Told how far the reading is.
+
+    Raises:
+        StudioError: The file cannot be read, or the saved plot not be opened; the message says what to do.
+    """
+    session = opening.open_plot(
+        path, scale=scale, up=up, project_dir=project_dir, read_only=read_only, progress=progress
+    )
+    return Plot(session)
