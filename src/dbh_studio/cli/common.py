@@ -73,7 +73,7 @@ def settings_from(options: argparse.Namespace) -> Any:
         path, equals, value = assignment.partition("=")
         section, dot, name = path.strip().partition(".")
         if not equals or not dot:
-            raise SettingError(f"--set {assignment}: expected SECTION.NAME=VALUE.", "For example trunks.otsu=false.")
+            raise SettingError(f"--set {assignment}: expected SECTION.NAME=VALUE.", "For example trunks.small_clusters=otsu.")
         chosen.setdefault(section, {})[name] = value.strip()
     settings = Settings()
     for section, values in chosen.items():

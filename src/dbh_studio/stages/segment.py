@@ -1,0 +1,255 @@
+"""From a cloud to trunks: candidates, then the paper's chain (section "Automated Tree Trunk Segmentation").
+
+    candidates   image masks where there are any, otherwise surfaces of stems found by `stem_detection`
+    ground       what is lower than the clearance is not trunk
+    normals      what does not face sideways is not trunk
+    clusters     DBSCAN
+    sizes        Otsu's threshold on the clusters' size; by default it cannot drop what is a stem by its rings
+    expansion    points near a cluster join it
+
+Everything is computed on points thinned to one per small cube and carried back to all points at the end, so that time
+and memory follow the surface of the stems and not the number of points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64, as_points, readonly
+from dbh_studio.core.ground import GroundModel
+from dbh_studio.core.neighbours import N_WORKERS, point_spacing
+from dbh_studio.core.progress import Progress, ignore_progress, subprogress
+from dbh_studio.core.voxels import thin
+from dbh_studio.settings import TrunkSettings
+from dbh_studio.stages.stem_detection import LAYER_M, Stem, detect_stems
+from dbh_studio.stages.trunk_chain import Chain, Cluster, Outcome
+
+_CHUNK = 1 << 20
+# More thinned points than this in the search slab are thinned further, so that large plots stay within memory and time.
+_MAX_SLAB_POINTS = 600_000
+_PIXEL_M = 0.10
+
+NO_TRUNK_NOTE = (
+    "No trunk was found. Check the scale and the up axis, the search heights, and that the cloud shows stems "
+    "between them; single trunks can also be selected by hand."
+)
+
+
+@dataclass(frozen=True)
+class SegmentationSteps:
+    """How many points were left after each step, and what became of every cluster: where a tree was lost.
+
+    Attributes:
+        n_points: Of the cloud.
+        n_stems_detected: By the rings.
+        n_candidates: Points on a stem's surface, or in a mask.
+        n_above_ground: Of these, higher than the clearance.
+        n_facing_sideways: Of these, with a normal within the largest tilt of horizontal.
+        clusters: Largest first.
+        size_threshold: Otsu's, points; NaN where it was not asked.
+        n_in_clusters: Points of the clusters kept.
+        n_expanded: Points of all trunks in the end.
+        spacing_m: Typical distance between points on a surface.
+    """
+
+    n_points: int = 0
+    n_stems_detected: int = 0
+    n_candidates: int = 0
+    n_above_ground: int = 0
+    n_facing_sideways: int = 0
+    clusters: tuple[Cluster, ...] = ()
+    size_threshold: float = float("nan")
+    n_in_clusters: int = 0
+    n_expanded: int = 0
+    spacing_m: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentationResult:
+    """The trunks of a plot.
+
+    Attributes:
+        point_sets: Per trunk the sorted indices into the cloud; disjoint, in order of x, then y.
+        stems: What the detector saw of each, in the same order; None for a trunk that came from masks alone.
+        notes: What the person should know, in plain words.
+        steps: Counts of every step.
+    """
+
+    point_sets: tuple[Int32, ...]
+    stems: tuple[Stem | None, ...]
+    notes: tuple[str, ...]
+    steps: SegmentationSteps
+
+
+def segment_trunks(
+    points_world: Float,
+    ground: GroundModel,
+    *,
+    settings: TrunkSettings = TrunkSettings(),  # noqa: B008 - frozen
+    candidates: Bool | None = None,
+    progress: Progress = ignore_progress,
+    seed: int = 0,
+) -> SegmentationResult:
+    """Find the trunks of a plot.
+
+    Args:
+        points_world: (N, 3) points, metres, +z up; float32 saves memory.
+        ground: From `core.ground.fit_ground`.
+        settings: Every parameter of the detector and the chain.
+        candidates: (N,) points that image masks call trunk ("label count of at least one" in the paper); None where
+            there are no masks, and the detector stands in for them.
+        progress: Called between steps and chunks.
+        seed: Of the random samples: the same seed gives the same trunks.
+
+    Returns:
+        The trunks; none, with a note, where nothing looks like one.
+
+    Raises:
+        ValueError: Wrong shapes.
+        CancelledError: From `progress`.
+    """
+    points = as_points(points_world, name="points_world")
+    if candidates is not None and np.shape(candidates) != (len(points),):
+        raise ValueError(f"candidates have shape {np.shape(candidates)} but ({len(points)},) is needed")
+    height = _heights(points, ground, subprogress(progress, 0.0, 0.15))
+    wanted = None if candidates is None else np.asarray(candidates, bool)
+    slab, spacing = _slab(points, height, wanted, settings)
+    stems = detect_stems(
+        slab, spacing_m=spacing, settings=settings, progress=subprogress(progress, 0.2, 0.5), seed=seed
+    )
+    # West to east, so that the numbering does not depend on which stem was surest.
+    stems = tuple(sorted(stems, key=lambda stem: tuple(stem.xy_at(1.3))))
+    steps = SegmentationSteps(n_points=len(points), n_stems_detected=len(stems), spacing_m=spacing)
+    rest = subprogress(progress, 0.5, 1.0)
+    if wanted is None:
+        rows = (
+            rows_in_column(points, height, *_footprint(stems, settings), settings) if stems else np.empty(0, np.int64)
+        )
+    else:
+        rows = np.flatnonzero(wanted)
+        n_candidates = len(rows)
+        rows = rows[(height[rows] >= settings.ground_clearance_m) & (height[rows] < settings.trunk_top_m)]
+        steps = replace(steps, n_candidates=n_candidates, n_above_ground=len(rows))
+    rest(0.1, "Following the stems")
+    chain = Chain(levelled(points, height, rows), stems, spacing, settings, subprogress(rest, 0.1, 0.8), seed)
+    outcome = chain.of_stems() if wanted is None else chain.of_masks()
+    labels = outcome.labels
+    if wanted is not None and len(outcome.stems):
+        rows, labels = _expanded_beyond_masks(points, height, rows, labels, chain, settings)
+    rest(0.95, "Following the stems")
+    return _result(rows, labels, outcome, steps)
+
+
+def levelled(points: Float, height: Float, rows: Int64) -> Float32:
+    """(M, 3) float32 x, y and height above ground of the points at `rows`: the slope is taken out, verticals stay."""
+    part = np.empty((len(rows), 3), np.float32)
+    part[:, :2] = points[rows, :2]
+    part[:, 2] = height[rows]
+    return part
+
+
+def _heights(points: Float, ground: GroundModel, progress: Progress) -> Float32:
+    height = np.empty(len(points), np.float32)
+    for start in range(0, len(points), _CHUNK):
+        progress(start / len(points), "Heights above ground")
+        height[start : start + _CHUNK] = ground.height_above(points[start : start + _CHUNK])
+    return height
+
+
+def _slab(points: Float, height: Float32, wanted: Bool | None, settings: TrunkSettings) -> tuple[Float32, float]:
+    """Thinned points of the search slab, and how far apart they are on a surface."""
+    inside = (height >= settings.slab_low_m) & (height < settings.slab_high_m)
+    rows = np.flatnonzero(inside if wanted is None else inside & wanted)
+    edge = settings.thinning_m
+    slab = thin(levelled(points, height, rows), edge).points
+    while len(slab) > _MAX_SLAB_POINTS:
+        edge *= 1.3
+        slab = thin(slab, edge).points
+    spacing = point_spacing(slab)
+    return slab, edge if np.isnan(spacing) else max(spacing, edge)
+
+
+def _footprint(stems: tuple[Stem, ...], settings: TrunkSettings) -> tuple[Float64, Float64]:
+    """(K, 2) positions along the stems' axes and (K,) how far from them a stem's surface may lie there."""
+    layers = np.arange(settings.ground_clearance_m, settings.trunk_top_m, LAYER_M)
+    xy = [stem.xy_at(height) for stem in stems for height in layers]
+    # Beyond the heights where rings were seen a stem may bend away from its axis.
+    beyond = [max(stem.heights_m[0] - h, h - stem.heights_m[-1], 0.0) for stem in stems for h in layers]
+    radius = np.repeat([stem.radius_m for stem in stems], len(layers))
+    return np.asarray(xy), 1.6 * radius + 0.12 + 0.06 * np.asarray(beyond)
+
+
+def rows_in_column(points: Float, height: Float32, xy: Float64, reach: Float64, settings: TrunkSettings) -> Int64:
+    """Rows of the points between ground clearance and trunk top that are, in plan, near any of the positions.
+
+    On a raster, so that the time does not depend on the number of positions and little on that of the points.
+
+    Args:
+        points: (N, 3) world.
+        height: (N,) above ground.
+        xy: (K, 2) positions.
+        reach: (K,) metres.
+        settings: Heights.
+    """
+    lower = xy.min(axis=0) - reach.max() - _PIXEL_M
+    shape = np.ceil((xy.max(axis=0) + reach.max() + _PIXEL_M - lower) / _PIXEL_M).astype(int) + 1
+    raster = np.zeros(shape, bool)
+    for size in np.unique(np.ceil(reach / _PIXEL_M).astype(int)):
+        chosen = np.ceil(reach / _PIXEL_M).astype(int) == size
+        steps = np.arange(-size, size + 1)
+        disc = np.argwhere(np.hypot(steps[:, None], steps[None, :]) <= size + 0.5) - size
+        pixel = ((xy[chosen] - lower) / _PIXEL_M).astype(int)
+        at = np.clip((pixel[:, None, :] + disc[None]).reshape(-1, 2), 0, shape - 1)
+        raster[at[:, 0], at[:, 1]] = True
+    found = []
+    for start in range(0, len(points), _CHUNK):
+        part = height[start : start + _CHUNK]
+        rows = np.flatnonzero((part >= settings.ground_clearance_m) & (part < settings.trunk_top_m)) + start
+        i, j = (np.floor((points[rows, axis] - lower[axis]) / _PIXEL_M).astype(np.int32) for axis in (0, 1))
+        inside = (i >= 0) & (i < shape[0]) & (j >= 0) & (j < shape[1])
+        found.append(rows[inside][raster[i[inside], j[inside]]])
+    return np.concatenate(found)
+
+
+def _expanded_beyond_masks(
+    points: Float, height: Float32, rows: Int64, labels: Int32, chain: Chain, settings: TrunkSettings
+) -> tuple[Int64, Int32]:
+    """Points outside the masks that are near a trunk found inside them join it."""
+    kept, kept_labels = chain.kept_points()
+    reach = np.full(len(kept), settings.expand_distance_m)
+    around = rows_in_column(points, height, kept[:, :2].astype(np.float64), reach, settings)
+    # What the chain has judged stays as it was judged.
+    around = np.setdiff1d(around, rows, assume_unique=True)
+    distance, nearest = cKDTree(kept).query(
+        levelled(points, height, around), distance_upper_bound=max(settings.expand_distance_m, 1e-9), workers=N_WORKERS
+    )
+    near = np.isfinite(distance)
+    return np.concatenate([rows, around[near]]), np.concatenate([labels, kept_labels[nearest[near]]])
+
+
+def _result(rows: Int64, labels: Int32, outcome: Outcome, steps: SegmentationSteps) -> SegmentationResult:
+    """Sorted point sets in order of position, without empty ones."""
+    inside = labels >= 0
+    rows, labels = rows[inside], labels[inside]
+    order = np.lexsort((rows, labels))
+    edges = np.searchsorted(labels[order], np.arange(len(outcome.stems) + 1))
+    sets = [rows[order[a:b]].astype(np.int32) for a, b in pairwise(edges)]
+    present = [k for k, points in enumerate(sets) if len(points)]
+    steps = replace(
+        steps,
+        n_candidates=steps.n_candidates or outcome.n_candidates,
+        n_above_ground=steps.n_above_ground or outcome.n_candidates,
+        n_facing_sideways=outcome.n_facing_sideways,
+        clusters=outcome.clusters,
+        size_threshold=outcome.size_threshold,
+        n_in_clusters=sum(cluster.n_points for cluster in outcome.clusters if cluster.kept),
+        n_expanded=len(rows),
+    )
+    notes = () if present else (NO_TRUNK_NOTE,)
+    return SegmentationResult(
+        tuple(readonly(sets[k]) for k in present), tuple(outcome.stems[k] for k in present), notes, steps
+    )
