@@ -7,11 +7,12 @@ Read, segment and measure in five lines::
     plot = dbh_studio.open_plot("plot.laz")               # a file, a folder or a saved NAME.dbh
     plot.find_trunks()                                    # ground, trunks
     for stem in plot.inventory():
-        print(stem.stem_id, stem.dbh_cm, stem.reason)     # dbh_cm is None where there is a reason
+        print(stem.stem_id, stem.dbh_cm, stem.reason)     # dbh_cm is None where it cannot be told; reason says why
 
 or measure one stem that is already cut out, z being the height above the ground::
 
     estimate = dbh_studio.measure_stem(points_m)          # DbhEstimate, or a falsy Refusal with reason and remedy
+    print(estimate.dbh_cm if estimate else estimate.reason)
 """
 
 from __future__ import annotations

@@ -32,6 +32,9 @@ class Plot:
     def settings(self, section: str, **values: Any) -> Plot:
         """Change settings, such as ``plot.settings("measure", curve="ellipse")``; see ``dbh-studio settings``.
 
+        Returns:
+            The plot, so that calls can be chained.
+
         Raises:
             CommandError: There is no such setting, or the value is outside its bounds.
         """
@@ -47,18 +50,34 @@ class Plot:
         return pipeline.segment(self.session, progress=progress, in_process=True)
 
     def inventory(self, *, progress: Progress = ignore_progress) -> Inventory:
-        """One row per stem; measures what is not measured yet."""
+        """One row per stem; measures what is not measured yet.
+
+        Empty before `find_trunks`. A row has `dbh_cm` None where the stem cannot be measured; its `reason` and `remedy`
+        say why and what would help. `reason` also names what to look at in a stem that was measured.
+        """
         return self.session.inventory(progress)
 
     def write_csv(self, path: Path | str) -> Path:
-        """Write the inventory."""
-        from dbh_studio.io.inventory_csv import write_inventory_csv
+        """Write the inventory as CSV; `path` is replaced whole or stays as it was. Returns it.
 
+        Raises:
+            FileError: The file cannot be written, or is what the plot is read from.
+        """
+        from dbh_studio.io.inventory_csv import check_not_source, write_inventory_csv
+
+        check_not_source(Path(path), self.session.document.source.used)
         return write_inventory_csv(Path(path), self.inventory())
 
     def close(self) -> None:
-        """Save what is left and release the saved plot."""
-        self.session.close()
+        """Save what is left and release the saved plot.
+
+        Raises:
+            ProjectError: The last changes could not be saved; the plot is released all the same.
+        """
+        try:
+            self.session.flush()
+        finally:
+            self.session.close()
 
 
 def open_plot(
@@ -77,7 +96,7 @@ def open_plot(
         scale: Metres per unit, or ``metres``, ``feet``, ``millimetres``; None for what the data says.
         up: ``+z``, ``+y``, … or a direction in the source; None for what the data says.
         project_dir: Save every change there; without it nothing is written.
-        read_only: Refuse changes.
+        read_only: Refuse changes; a saved plot may then be open elsewhere.
         progress: Told how far the reading is.
 
     Raises:

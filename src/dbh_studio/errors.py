@@ -12,6 +12,8 @@
     ├── MissingComponentError       an optional package or system library is absent
     ├── ProjectError                the saved plot
     │   ├── ProjectLockedError      another process is writing it
+    │   ├── ProjectExistsError      there is one already, and it may hold edits
+    │   ├── ProjectMismatchError    its trunks are those of another cloud
     │   └── ProjectVersionError     written by a newer program
     ├── StaleResultError            the plot changed while a job ran
     ├── CommandError                an edit that cannot be applied
@@ -95,6 +97,14 @@ class ProjectError(StudioError):
 
 class ProjectLockedError(ProjectError):
     """Another process is writing this plot."""
+
+
+class ProjectExistsError(ProjectError):
+    """There is a saved plot where a new one was to be made."""
+
+
+class ProjectMismatchError(ProjectError):
+    """The saved plot was made from another cloud."""
 
 
 class ProjectVersionError(ProjectError):

@@ -3,84 +3,157 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import re
+import shutil
 import sys
 import time
+from pathlib import Path
 from typing import Any, TextIO
 
-from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.errors import SettingError
+from dbh_studio.errors import SettingError, UnscaledCloudError
 
-SCALE_WORDS = ("metres", "feet", "millimetres")
+UP_AXES = ("+z", "-z", "+y", "-y", "+x", "-x")
 
 
-def add_cloud_options(parser: argparse.ArgumentParser) -> None:
-    """Options that say how a cloud is to be understood."""
+def add_cloud_options(parser: argparse.ArgumentParser, *, otherwise: str = "the command stops") -> None:
+    """Options that say how a cloud is to be understood, and what happens without them."""
     parser.add_argument(
         "--scale",
         type=scale_argument,
         metavar="M_PER_UNIT",
-        help="metres per unit of the file (1.33231), or: metres, feet, millimetres; without it the unit is taken from "
-        "the file where it can be told, and the command stops where it cannot",
+        help="metres per unit of the file (1.33231), or the unit's name: metres, feet, us-feet, centimetres, "
+        f"millimetres; without it the unit is taken from the file, and where that does not tell, {otherwise}",
     )
-    parser.add_argument("--up", choices=("+z", "-z", "+y", "-y", "+x", "-x"), help="which way is up in the file")
+    parser.add_argument("--up", choices=UP_AXES, help="which way is up in the file")
 
 
-def add_settings_options(parser: argparse.ArgumentParser) -> None:
-    """The settings used most under their own names, and all of them by ``--set``."""
+def add_relocation_option(parser: argparse.ArgumentParser) -> None:
+    """Where the cloud of a saved plot has gone."""
+    parser.add_argument(
+        "--cloud", type=path_argument, metavar="FILE", help="where the cloud of a saved NAME.dbh is now, if it moved"
+    )
+
+
+def add_settings_options(parser: argparse.ArgumentParser, *, only_measure: bool = False) -> None:
+    """The settings used most under their own names, and all of them (or those of measuring) by ``--set``."""
     parser.add_argument("--curve", choices=("fourier", "ellipse", "bspline"), help="curve the diameter is read from")
     parser.add_argument("--breast-height", type=float, metavar="M", help="1.30, 1.37 (4.5 ft), 1.40 or another, metres")
-    parser.add_argument("--ground", choices=("terrain", "plane"), help="terrain surface, or the paper's single plane")
+    if not only_measure:
+        parser.add_argument("--ground", choices=("terrain", "plane"), help="terrain, or the paper's single plane")
+    example = "measure.definition=tape" if only_measure else "trunks.min_diameter_cm=8"
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
         dest="assignments",
-        help="any setting, such as trunks.min_diameter_cm=8; `dbh-studio settings` lists them",
+        help=f"any setting, such as {example}; may be given several times; `dbh-studio settings` lists them",
     )
 
 
-def scale_argument(text: str) -> float | str:
-    """A positive number or one of the unit names."""
-    if text in SCALE_WORDS:
-        return text
+def path_argument(text: str) -> Path:
+    """A path; an empty one, as from an unset variable of a script, is not the folder one happens to be in."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
+
+
+def positive_integer(text: str) -> int:
+    """A whole number above zero."""
     try:
-        value = float(text)
+        value = int(text)
     except ValueError:
-        value = -1.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a positive number nor one of {', '.join(SCALE_WORDS)}")
+        value = 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
     return value
 
 
-def settings_from(options: argparse.Namespace) -> Any:
-    """The `Settings` that the options describe.
+def port_number(text: str) -> int:
+    """A TCP port."""
+    value = positive_integer(text)
+    if value > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port; ports are 1 to 65535")
+    return value
+
+
+def scale_argument(text: str) -> str:
+    """A positive number or the name of a unit, as text."""
+    from dbh_studio.app.opening import scale_from
+
+    try:
+        if text.strip() and scale_from(text).is_known:
+            return text
+    except SettingError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    raise argparse.ArgumentTypeError(f"{text!r} says nothing; leave --scale away where the scale is not known")
+
+
+def settings_changes(options: argparse.Namespace, *, only_measure: bool = False) -> dict[str, dict[str, Any]]:
+    """What the options change in the settings: section -> name -> value; checked.
 
     Raises:
         SettingError: An unknown name or a value outside its bounds.
     """
     from dbh_studio.settings import Settings
 
-    chosen: dict[str, dict[str, Any]] = {}
+    changes: dict[str, dict[str, Any]] = {}
     for section, name, value in (
         ("measure", "curve", options.curve),
         ("measure", "breast_height_m", options.breast_height),
-        ("ground", "method", options.ground),
+        ("ground", "method", getattr(options, "ground", None)),
     ):
         if value is not None:
-            chosen.setdefault(section, {})[name] = value
+            changes.setdefault(section, {})[name] = value
     for assignment in options.assignments:
         path, equals, value = assignment.partition("=")
         section, dot, name = path.strip().partition(".")
         if not equals or not dot:
-            raise SettingError(f"--set {assignment}: expected SECTION.NAME=VALUE.", "For example trunks.small_clusters=otsu.")
-        chosen.setdefault(section, {})[name] = value.strip()
-    settings = Settings()
-    for section, values in chosen.items():
-        if section not in Settings.model_fields:
-            raise SettingError(f"There are no settings called {section!r}.", f"Use {', '.join(Settings.model_fields)}.")
-        settings = settings.model_copy(update={section: getattr(settings, section).changed(**values)})
-    return settings
+            raise SettingError(
+                f"--set {assignment}: expected SECTION.NAME=VALUE.", "For example measure.definition=tape."
+            )
+        _check_name(section, name)
+        if only_measure and section != "measure":
+            raise SettingError(
+                f"--set {assignment}: only settings of measuring count here.", "They begin with measure."
+            )
+        changes.setdefault(section, {})[name] = value.strip()
+    for section, values in changes.items():
+        getattr(Settings(), section).changed(**values)
+    return changes
+
+
+def _check_name(section: str, name: str) -> None:
+    from dbh_studio.settings import Settings
+
+    if section not in Settings.model_fields:
+        raise SettingError(f"There are no settings called {section!r}.", f"Use {', '.join(Settings.model_fields)}.")
+    names = list(type(getattr(Settings(), section)).model_fields)
+    if name not in names:
+        near = difflib.get_close_matches(name, names, 1, 0.4)
+        meant = f"Did you mean {section}.{near[0]}? " if near else ""
+        raise SettingError(f"There is no setting {section}.{name}.", f"{meant}`dbh-studio settings` lists them.")
+
+
+def unscaled_error() -> UnscaledCloudError:
+    """What a person at the command line can do about a cloud without a scale."""
+    return UnscaledCloudError(
+        "The file does not tell how long its unit is, so no diameter can be given.",
+        "Say it: --scale metres (or feet, us-feet, centimetres, millimetres), or metres per unit such as "
+        "--scale 1.332. A cloud from photographs has a scale of its own: open it in the studio with `dbh-studio open` "
+        "and set it there by markers or a length measured in the field.",
+    )
+
+
+def counted(n: int, noun: str) -> str:
+    """``1 stem``, ``2 stems``."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def plain(text: str) -> str:
+    """Text for a terminal: no control characters but the line feed, whatever a file is called."""
+    return re.sub(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]", "?", text)
 
 
 class ProgressLine:
@@ -89,10 +162,17 @@ class ProgressLine:
     _WIDTH = 28
 
     def __init__(self, stream: TextIO | None = None, *, enabled: bool = True) -> None:
-        self._stream = stream if stream is not None else sys.stderr
-        self._enabled = enabled and self._stream.isatty()
+        stream = stream if stream is not None else sys.stderr
+        self._stream = stream
+        self._enabled = enabled and stream is not None and stream.isatty()
         self._last_time = 0.0
         self._last_message = ""
+
+    def __enter__(self) -> ProgressLine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.finish()
 
     def __call__(self, fraction: float, message: str = "") -> None:
         """Draw the bar, at most ten times a second."""
@@ -102,7 +182,9 @@ class ProgressLine:
         self._last_time, self._last_message = now, message
         done = round(self._WIDTH * min(max(fraction, 0.0), 1.0))
         bar = "#" * done + "-" * (self._WIDTH - done)
-        self._stream.write(f"\r\x1b[K[{bar}] {100 * fraction:3.0f} % {message}")
+        line = plain(f"[{bar}] {100 * fraction:3.0f} % {message}").replace("\n", " ")
+        # A line that wraps could not be taken back.
+        self._stream.write(f"\r\x1b[K{line[: shutil.get_terminal_size().columns - 1]}")
         self._stream.flush()
 
     def finish(self) -> None:
@@ -112,8 +194,6 @@ class ProgressLine:
             self._stream.flush()
 
 
-def progress_for(options: argparse.Namespace) -> Progress:
-    """A progress line unless the command was asked to be quiet or to speak JSON."""
-    if getattr(options, "quiet", False):
-        return ignore_progress
-    return ProgressLine()
+def progress_for(options: argparse.Namespace) -> ProgressLine:
+    """A progress line unless the command was asked to be quiet."""
+    return ProgressLine(enabled=not options.quiet)

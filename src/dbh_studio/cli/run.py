@@ -4,11 +4,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
-from pathlib import Path
 from typing import Any
 
-from dbh_studio.cli.common import add_cloud_options, add_settings_options, progress_for, settings_from
+from dbh_studio.cli.common import (
+    add_cloud_options,
+    add_relocation_option,
+    add_settings_options,
+    counted,
+    path_argument,
+    plain,
+    progress_for,
+    settings_changes,
+    unscaled_error,
+)
+from dbh_studio.errors import ProjectExistsError, ProjectLockedError, UnscaledCloudError
 
 
 def add_commands(commands: Any) -> None:
@@ -16,17 +27,25 @@ def add_commands(commands: Any) -> None:
     run = commands.add_parser(
         "run",
         help="read a plot, find and measure its trunks, write the inventory",
-        description="Read a plot, find and measure its trunks, and write NAME.csv and the saved plot NAME.dbh.",
+        description="Read a plot, find and measure its trunks, and write DIR/NAME.csv and the saved plot DIR/NAME.dbh, "
+        "which `dbh-studio open` shows. A saved plot is measured again with the trunks it has.",
     )
-    run.add_argument("plot", type=Path, help="a cloud, a mesh, a folder of them, or a saved NAME.dbh")
+    run.add_argument("plot", type=path_argument, help="a cloud, a mesh, a folder of them, or a saved NAME.dbh")
     run.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the inventory and the saved plot"
+        "--out",
+        type=path_argument,
+        required=True,
+        metavar="DIR",
+        help="folder for the inventory and the saved plot; made where it is not there",
     )
     add_cloud_options(run)
+    add_relocation_option(run)
     add_settings_options(run)
     run.add_argument("--name", default="", help="what to call the plot; the file's name by default")
     run.add_argument(
-        "--overwrite", action="store_true", help="replace the saved plot of an earlier run, and edits made in it"
+        "--overwrite",
+        action="store_true",
+        help="replace the saved plot and the table of an earlier run, and edits made in them",
     )
     run.add_argument("--json", action="store_true", help="print the result as JSON")
     run.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -37,49 +56,71 @@ def run_plot(options: argparse.Namespace) -> int:
     """Run the whole chain."""
     from dbh_studio.app import pipeline
 
-    progress = progress_for(options)
-    customised = options.assignments or options.curve or options.breast_height is not None or options.ground
+    changes = settings_changes(options)
     try:
-        result = pipeline.run_plot(
-            options.plot,
-            options.out,
-            scale=options.scale,
-            up=options.up,
-            settings=settings_from(options) if customised else None,
-            plot_id=options.name,
-            overwrite=options.overwrite,
-            progress=progress,
-        )
-    finally:
-        getattr(progress, "finish", lambda: None)()
+        with progress_for(options) as progress:
+            result = pipeline.run_plot(
+                options.plot,
+                options.out,
+                scale=options.scale,
+                up=options.up,
+                settings=changes,
+                plot_id=options.name,
+                relocate=options.cloud,
+                overwrite=options.overwrite,
+                progress=progress,
+            )
+    except UnscaledCloudError:
+        raise unscaled_error() from None
+    except ProjectExistsError as error:
+        remedy = "Give `run` that plot itself to measure it again, choose another --out or --name, or add --overwrite."
+        raise ProjectExistsError(error.problem, remedy) from None
+    except ProjectLockedError as error:
+        raise ProjectLockedError(error.problem, "Close it there, or choose another --out.") from None
     inventory = result.session.inventory()
-    scale = result.session.document.scale
     result.session.close()
     if options.json:
-        summary = {
-            "plot": result.session.document.plot_id,
-            "csv": str(result.csv_path),
-            "project": str(result.project_dir),
-            "n_stems": len(inventory),
-            "n_measured": len(inventory) - inventory.n_refused,
-            "n_refused": inventory.n_refused,
-            "metres_per_unit": scale.metres_per_unit,
-            "scale_source": scale.source,
-            "notes": list(result.notes),
-            "seconds": {step: round(seconds, 3) for step, seconds in result.timings_s.items()},
-            "stems": [
-                {"stem_id": row.stem_id, "dbh_cm": row.dbh_cm, "x_m": row.x_m, "y_m": row.y_m, "reason": row.reason}
-                for row in inventory
-            ],
-        }
-        print(json.dumps(summary, indent=2))
+        print(json.dumps(_summary(result, inventory), indent=2))
     elif not options.quiet:
         for note in result.notes:
-            print(f"note: {note}", file=sys.stderr)
-        print(_table(inventory))
-        print(f"\n{len(inventory)} stems, {len(inventory) - inventory.n_refused} with a diameter: {result.csv_path}")
-        print(f"Look at them: dbh-studio open {result.project_dir}")
+            print(f"note: {plain(note)}", file=sys.stderr)
+        print(plain(_table(inventory)))
+        n_measured = len(inventory) - inventory.n_refused
+        print(plain(f"\n{counted(len(inventory), 'stem')}, {n_measured} with a diameter: {result.csv_path}"))
+        print(plain(f"Look at them: dbh-studio open {shlex.quote(str(result.project_dir))}"))
     return 0
+
+
+def _summary(result: Any, inventory: Any) -> dict[str, Any]:
+    """What ``--json`` prints; the names in it stay."""
+    scale = result.session.document.scale
+    return {
+        "plot": result.session.document.plot_id,
+        "csv": str(result.csv_path),
+        "project": str(result.project_dir),
+        "n_stems": len(inventory),
+        "n_measured": len(inventory) - inventory.n_refused,
+        "n_refused": inventory.n_refused,
+        "metres_per_unit": scale.metres_per_unit,
+        "scale_source": scale.source,
+        "notes": list(result.notes),
+        "seconds": {step: round(seconds, 3) for step, seconds in result.timings_s.items()},
+        "stems": [
+            {
+                "stem_id": row.stem_id,
+                "dbh_cm": _rounded(row.dbh_cm, 2),
+                "x_m": _rounded(row.x_m, 3),
+                "y_m": _rounded(row.y_m, 3),
+                "quality": row.quality,
+                "reason": row.reason,
+            }
+            for row in inventory
+        ],
+    }
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
 
 
 def _table(inventory: Any) -> str:
@@ -87,5 +128,6 @@ def _table(inventory: Any) -> str:
     for row in inventory:
         diameter = "-" if row.dbh_cm is None else f"{row.dbh_cm:.1f}"
         arc = "-" if row.coverage_deg is None else f"{row.coverage_deg:.0f}"
-        lines.append(f"{row.stem_id:>5} {diameter:>7} {row.quality or '-':<8} {arc:>4}  {row.reason or row.note or ''}")
+        remark = row.reason or row.note or ""
+        lines.append(f"{row.stem_id:>5} {diameter:>7} {row.quality or '-':<8} {arc:>4}  {remark}".rstrip())
     return "\n".join(lines)
