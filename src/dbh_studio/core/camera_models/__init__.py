@@ -1,0 +1,1 @@
+"""Lens models: `lenses` holds the formulas, `inverse` turns them round."""
