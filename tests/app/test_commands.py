@@ -41,8 +41,12 @@ def document() -> Document:
         commands.set_tree_record(1, colour="red"),
         commands.set_tree_record(1, species=5),
         commands.set_tree_record(1, tree_id=0),
+        commands.set_tree_record(1, tree_id=2**31),
+        commands.set_tree_record(1, note="half a pair \ud800"),
+        commands.set_tree_record(1, edited="yes"),
+        commands.rename_plot("half a pair \ud800"),
     ],
-    ids=lambda command: command.label,
+    ids=lambda command: ascii(command.label),
 )
 def test_an_illegal_command_is_refused_in_words_and_changes_nothing(document, command):
     before = contents(document)
@@ -109,6 +113,38 @@ def test_the_first_trunks_keep_their_own_numbers():
     document = make_document(make_cloud())
     after = commands.replace_trunks(TrunkSet((trunk(17, 1, 2), trunk(230, 5, 6)))).apply(document)
     assert after.trunks.ids == (17, 230) and after.trunks.next_id == 231
+
+
+def test_a_files_own_numbers_stay_unless_another_trunk_has_them(document):
+    """Whatever numbers were given out meanwhile: in the field the trees bear those of the file."""
+    emptied = replace(document, trunks=TrunkSet(next_id=308))
+    own = TrunkSet((trunk(107, 1, 2, origin="file"), trunk(207, 5, 6, origin="file"), trunk(9, 7, 8)))
+    after = commands.replace_trunks(own).apply(emptied)
+    assert after.trunks.ids == (107, 207, 308) and after.trunks.next_id == 309
+    assert after.trunks[308].points.tolist() == [7, 8]
+    # Present are trunks 1 to 3 on points 0..29: one is found again, one number is taken, one is free and high.
+    found = TrunkSet((trunk(2, 500, 501, origin="file"), trunk(50, *range(20, 30), origin="file"), trunk(4, 7, 8)))
+    found = found.with_trunk(trunk(77, 600, 601, origin="file"))
+    after = commands.replace_trunks(found).apply(commands.set_tree_record(2, species="oak").apply(document))
+    points = {t.id: t.points[0] for t in after.trunks}
+    assert points[3] == 20 and points[77] == 600 and 2 not in points and after.trees.get(2) is None
+    assert sorted(points) == [3, 77, 78, 79] and after.trunks.next_id == 80
+
+
+def test_where_no_number_is_left_it_says_so(document):
+    full = replace(document, trunks=TrunkSet(document.trunks.trunks, 2**31 - 1))
+    two = TrunkSet((trunk(1, 500, 501), trunk(2, 600, 601)))
+    with pytest.raises(CommandError, match="number"):
+        commands.replace_trunks(two).apply(full)
+    assert commands.replace_trunks(two.without(2)).apply(full).trunks.ids == (2**31 - 1,)
+    with pytest.raises(ValueError, match="at most"):
+        trunk(2**31, 1)
+
+
+@pytest.mark.parametrize("error", [float("nan"), float("inf"), -0.1])
+def test_a_standard_error_is_a_number(error):
+    with pytest.raises(ValueError, match="standard error"):
+        ScaleEstimate(1.0, "marker", error)
 
 
 def test_trunks_found_again_keep_id_and_record_and_others_get_new_ids(document):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gc
+import threading
 import weakref
 
 import numpy as np
@@ -56,7 +57,7 @@ def test_every_input_of_a_measurement_is_in_its_key():
         stages.measured.clear()
         session.do(command)
         session.measurements()
-        assert stages.measured == [1, 2, 3], command.label
+        assert sorted(stages.measured) == [1, 2, 3], command.label
         assert stages.n_grounds == n_grounds, command.label
     stages.measured.clear()
     while session.can_undo:
@@ -147,13 +148,82 @@ def test_map_coordinates_come_from_the_source_and_only_where_they_are_easting_an
 
 
 def test_progress_can_stop_measuring():
-    session, stages = make_session(n_trunks=5)
+    session, stages = make_session(n_trunks=20)
 
     def stop(fraction, message=""):
-        if fraction >= 0.4:
+        if fraction >= 0.1:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
         session.measurements(stop)
-    assert stages.measured == [1, 2]
+    # Two were reported; a few more may have been under way.
+    assert {1, 2} <= set(stages.measured) <= set(range(1, 7))
     assert session.document.scale == METRES
+
+
+def test_while_the_ground_is_fitted_nobody_waits_who_does_not_need_it():
+    cloud = make_cloud()
+    document = make_document(cloud, n_trunks=2)
+    begun, may_end, n_fits = threading.Event(), threading.Event(), 0
+
+    def slow_fit(points_world, *, settings, progress):
+        nonlocal n_fits
+        n_fits += 1
+        begun.set()
+        assert may_end.wait(30)
+        return FlatGround()
+
+    derived = Derived(cloud, fit_ground=slow_fit)
+    grounds = []
+    threads = [threading.Thread(target=lambda: grounds.append(derived.ground(document))) for _ in range(3)]
+    answers = []
+
+    def look():
+        answers.append((derived.has_ground(document), derived.known_measurement(document, 1)))
+
+    looker = threading.Thread(target=look)
+    try:
+        for thread in threads:
+            thread.start()
+        assert begun.wait(30)
+        looker.start()
+        looker.join(10)
+        assert answers == [(False, None)]
+    finally:
+        may_end.set()
+        for thread in (*threads, looker):
+            thread.join(30)
+    assert n_fits == 1 and len(grounds) == 3 and len(set(map(id, grounds))) == 1
+
+
+def test_a_fit_that_fails_is_begun_again_by_whoever_waited_for_it():
+    cloud = make_cloud()
+    document = make_document(cloud)
+    begun, may_fail, fits = threading.Event(), threading.Event(), []
+
+    def fit(points_world, *, settings, progress):
+        fits.append(threading.current_thread().name)
+        if len(fits) == 1:
+            begun.set()
+            assert may_fail.wait(30)
+            raise InterruptedError
+        return FlatGround()
+
+    derived = Derived(cloud, fit_ground=fit)
+    outcomes = {}
+
+    def ask():
+        try:
+            outcomes[threading.current_thread().name] = derived.ground(document)
+        except InterruptedError:
+            outcomes[threading.current_thread().name] = None
+
+    first, second = (threading.Thread(target=ask, name=name) for name in ("first", "second"))
+    first.start()
+    assert begun.wait(30)
+    second.start()
+    may_fail.set()
+    first.join(30)
+    second.join(30)
+    assert fits == ["first", "second"]
+    assert outcomes["first"] is None and isinstance(outcomes["second"], FlatGround)

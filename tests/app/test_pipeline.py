@@ -30,6 +30,7 @@ from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.errors import (
     CommandError,
+    FileError,
     FileMissingError,
     ProjectError,
     ProjectLockedError,
@@ -126,6 +127,69 @@ def test_from_a_file_to_the_table_and_the_saved_plot(las, tmp_path):
     again.session.close()
     rows = table(again.csv_path)
     assert [(row["stem_id"], row["dbh_method"]) for row in rows] == [("1", "ellipse"), ("3", "ellipse")]
+
+
+def test_a_table_never_takes_the_place_of_the_cloud(tmp_path):
+    points, _ = stems_and_ground()
+    cloud = tmp_path / "plot.csv"
+    np.savetxt(cloud, points[::20], fmt="%.3f", delimiter=",")
+    before = cloud.read_bytes()
+    for overwrite in (False, True):
+        with pytest.raises(FileError, match="read from it"):
+            run_plot(cloud, tmp_path, scale="metres", overwrite=overwrite)
+    tiles = tmp_path / "tiles"
+    tiles.mkdir()
+    shutil.copy(cloud, tiles / "tiles.csv")
+    with pytest.raises(FileError, match="read from it"):
+        run_plot(tiles, tiles, scale="metres", overwrite=True)
+    session = open_plot(cloud, scale="metres", project_dir=tmp_path / "plot.dbh")
+    session.close()
+    for overwrite in (False, True):
+        with pytest.raises(FileError):
+            run_plot(tmp_path / "plot.dbh", tmp_path, overwrite=overwrite)
+    assert cloud.read_bytes() == before == (tiles / "tiles.csv").read_bytes()
+
+
+def test_a_table_somebody_made_is_kept_unless_one_says_so(las, tmp_path):
+    out = tmp_path / "out"
+    run_plot(las, out).session.close()
+    table_path = out / "plot.csv"
+    own = table_path.read_bytes()
+    # Again from the saved plot: the table is its own.
+    run_plot(out / "plot.dbh", out).session.close()
+    assert table_path.read_bytes() == own
+    edited = own.replace(b"plot_id", b"stand", 1)
+    table_path.write_bytes(edited)
+    with pytest.raises(FileError, match="already"):
+        run_plot(out / "plot.dbh", out)
+    assert table_path.read_bytes() == edited
+    # A plot that is made anew did not write any table that is there.
+    shutil.rmtree(out / "plot.dbh")
+    table_path.write_bytes(own)
+    with pytest.raises(FileError, match="already"):
+        run_plot(las, out)
+    assert not (out / "plot.dbh").exists()
+    table_path.write_bytes(edited)
+    run_plot(las, out, overwrite=True).session.close()
+    assert table_path.read_bytes() == own
+
+
+def test_a_file_of_the_same_name_beside_a_moved_plot_does_not_hide_its_cloud(las, tmp_path):
+    folder, elsewhere = tmp_path / "plot.dbh", tmp_path / "elsewhere"
+    open_plot(las, project_dir=folder).close()
+    elsewhere.mkdir()
+    shutil.move(folder, elsewhere / "plot.dbh")
+    cloud = make_cloud()
+    write_las(elsewhere / "plot.las", cloud.subset(np.arange(len(cloud) - 1)))
+    session = open_plot(elsewhere / "plot.dbh")
+    assert session.document.source.path == las
+    session.close()
+    assert read_project(elsewhere / "plot.dbh").source_path == las
+    las.unlink()
+    with pytest.raises(FileMissingError):
+        open_plot(elsewhere / "plot.dbh")
+    with pytest.raises(ProjectError, match="not the cloud"):
+        open_plot(elsewhere / "plot.dbh", relocate=elsewhere / "plot.las")
 
 
 def test_a_cloud_without_a_unit_needs_a_scale_and_leaves_nothing_behind_until_it_has_one(ply, tmp_path):
@@ -338,3 +402,26 @@ def test_a_real_plot(tmp_path):
     measured = [float(row["dbh_cm"]) for row in rows if row["dbh_cm"]]
     assert len(measured) >= 10 and 10 < np.median(measured) < 30
     assert all(row["reason"] and row["remedy"] for row in rows if not row["dbh_cm"])
+
+
+@pytest.mark.parametrize("given", ["1e30", "1e300", 1e-300, 2e4, 1e-7, ScaleEstimate(1e5, "factor")])
+def test_a_scale_beyond_reason_is_refused_before_anything_is_read(given, tmp_path):
+    with pytest.raises(SettingError, match="metres per unit") as caught:
+        open_plot(tmp_path / "nothing.las", scale=given)
+    assert "metres" in caught.value.remedy
+
+
+def test_the_scale_makes_no_metres_of_degrees(tmp_path):
+    pytest.importorskip("pyproj")
+    points, _ = stems_and_ground()
+    path = tmp_path / "degrees.las"
+    write_las(path, PointCloud.from_points(points * [1e-5, 1e-5, 1.0] + [15.0, 45.0, 100.0], crs="EPSG:4326"))
+    for scale in ("metres", 0.3048, ScaleEstimate(111_000.0 / 1e5, "bars")):
+        with pytest.raises(SettingError, match="degrees") as caught:
+            open_plot(path, scale=scale)
+        assert "projected" in caught.value.remedy
+    with pytest.raises(SettingError, match="degrees"):
+        run_plot(path, tmp_path / "out", scale="metres")
+    assert not (tmp_path / "out").exists()
+    # It can be looked at, without a scale.
+    assert not open_plot(path).document.scale.is_known

@@ -6,9 +6,11 @@ import errno
 import json
 import os
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -16,9 +18,10 @@ from tests.app.plots import contents, make_session, make_trunks
 
 from dbh_studio.app import commands
 from dbh_studio.app.autosave import Autosave, document_from_state
+from dbh_studio.app.opening import save_as
 from dbh_studio.app.session import Session
 from dbh_studio.core.scale import ScaleEstimate
-from dbh_studio.errors import CommandError
+from dbh_studio.errors import CommandError, ProjectError
 from dbh_studio.io.project import ProjectWriter, read_project
 
 
@@ -167,6 +170,89 @@ def test_an_id_given_out_and_undone_is_not_given_out_after_reopening(tmp_path):
     reopened = Session(session.cloud, document)
     reopened.do(commands.replace_trunks(make_trunks(2)))
     assert reopened.document.trunks.ids == (4, 5)
+
+
+def test_an_edit_during_the_first_save_is_saved(tmp_path, monkeypatch):
+    folder = tmp_path / "plot.dbh"
+    session, _ = make_session()
+    before = session.document
+    editor = threading.Thread(target=lambda: session.do(commands.delete_trunk(1)))
+    save = ProjectWriter.save
+
+    def slow(self, state, **options):
+        monkeypatch.setattr(ProjectWriter, "save", save)
+        editor.start()
+        while session.document is before:
+            time.sleep(0.001)
+        save(self, state, **options)
+
+    monkeypatch.setattr(ProjectWriter, "save", slow)
+    saver = keep(session, folder, background=True)
+    editor.join(30)
+    assert saver.flush()
+    assert read_project(folder).trunks.ids == (2, 3, 4, 5)
+    assert history(folder) == ["Create the plot", "Delete trunk 1"]
+    session.close()
+
+
+def test_an_edit_while_a_plot_gets_another_folder_is_saved_there(tmp_path, monkeypatch):
+    session, _ = make_session()
+    save_as(session, tmp_path / "a.dbh", background=False)
+    first, close = session.saver, Autosave.close
+
+    def edited_meanwhile(self):
+        if self is first:
+            session.do(commands.delete_trunk(1))
+        return close(self)
+
+    monkeypatch.setattr(Autosave, "close", edited_meanwhile)
+    save_as(session, tmp_path / "b.dbh", background=False)
+    assert read_project(tmp_path / "b.dbh").trunks.ids == (2, 3, 4, 5)
+    session.close()
+
+
+def test_a_plot_that_cannot_be_saved_elsewhere_stays_where_it_is(tmp_path, monkeypatch):
+    session, _ = make_session()
+    saver = save_as(session, tmp_path / "a.dbh", background=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(ProjectWriter, "save", _fail)
+        with pytest.raises(ProjectError, match="something unforeseen"):
+            save_as(session, tmp_path / "b.dbh", background=False)
+    assert session.saver is saver
+    session.do(commands.delete_trunk(1))
+    assert read_project(tmp_path / "a.dbh").trunks.ids == (2, 3, 4, 5)
+    ProjectWriter(tmp_path / "b.dbh").close()
+    session.close()
+
+
+def test_a_last_save_that_fails_is_told(tmp_path, monkeypatch, caplog):
+    session, _ = make_session()
+    saver = keep(session, tmp_path / "plot.dbh")
+    monkeypatch.setattr(ProjectWriter, "save", _fail)
+    session.do(commands.delete_trunk(1))
+    with pytest.raises(ProjectError, match="something unforeseen"):
+        session.flush()
+    caplog.clear()
+    session.close()
+    assert [record.levelname for record in caplog.records if "plot.dbh" in record.getMessage()] == ["ERROR"]
+    assert saver.status.state == "not_saved"
+    assert saver.close().state == "not_saved"
+    ProjectWriter(tmp_path / "plot.dbh").close()
+
+
+def test_what_is_saved_nowhere_is_flushed_at_once():
+    session, _ = make_session()
+    session.flush()
+
+
+def test_a_plot_in_place_of_another_begins_a_history(tmp_path):
+    folder = tmp_path / "plot.dbh"
+    for label in ("the first", "the second"):
+        session, _ = make_session()
+        save_as(session, folder, overwrite=True, background=False, label=label)
+        session.close()
+    assert history(folder) == ["the second"]
+    assert "the first" in (folder / "history-1.jsonl").read_text(encoding="utf-8")
 
 
 text = st.text(st.characters(codec="utf-8"), max_size=5)

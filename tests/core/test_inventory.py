@@ -105,7 +105,20 @@ def test_an_inventory_is_in_order_and_counts():
         Inventory.of([refused, refused])
 
 
-@pytest.mark.parametrize("fields", [{"status": "asleep"}, {"species": 5}, {"tree_id": 0}, {"note": None}])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"status": "asleep"},
+        {"species": 5},
+        {"tree_id": 0},
+        {"tree_id": 2**31},
+        {"tree_id": 1.5},
+        {"tree_id": True},
+        {"note": None},
+        {"note": "\ud800"},
+        {"edited": "yes"},
+    ],
+)
 def test_a_record_holds_only_what_it_can(fields):
     with pytest.raises(ValueError, match="must be"):
         TreeRecord(**fields)

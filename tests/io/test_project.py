@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -261,6 +262,56 @@ def _trunks(**arrays):
     return edit
 
 
+def _members(**contents):
+    """Rewrite the archive of the trunks, with the bytes of some members replaced."""
+
+    def edit(folder: Path) -> None:
+        path = folder / "trunks-1.npz"
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        members.update({f"{name}.npy": content for name, content in contents.items()})
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, content)
+
+    return edit
+
+
+def _npy(header: str, content: bytes = b"") -> bytes:
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + content
+
+
+def _plain_array(folder: Path) -> None:
+    np.save(folder / "array.npy", np.arange(5))
+    (folder / "array.npy").replace(folder / "trunks-1.npz")
+
+
+def _compressed(folder: Path) -> None:
+    with np.load(folder / "trunks-1.npz") as archive:
+        arrays = dict(archive)
+    np.savez_compressed(folder / "trunks-1.npz", **arrays)
+
+
+def _flags(*, method: int, encrypted: int):
+    """Say in the archive's headers that its members are packed in another way."""
+
+    def edit(folder: Path) -> None:
+        path = folder / "trunks-1.npz"
+        content = bytearray(path.read_bytes())
+        for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+            start = content.find(signature)
+            while start >= 0:
+                content[start + offset] |= encrypted
+                content[start + offset + 2] = method
+                start = content.find(signature, start + 4)
+        path.write_bytes(content)
+
+    return edit
+
+
+_HUGE = "{'descr': '<i4', 'fortran_order': False, 'shape': (100000000000000,), }"
+
+
 def _cut(name: str, share: float):
     def edit(folder: Path) -> None:
         content = (folder / name).read_bytes()
@@ -306,6 +357,24 @@ def _flip(folder: Path) -> None:
         (_trunks(ends=[2]), "lengths"),
         (_trunks(ids=[1, 1]), "same id"),
         (_trunks(ids=[0, 1]), "positive"),
+        (_trunks(ids=[1, 2**31]), "trunks-1.npz"),
+        (_trunks(surplus=[1]), "trunks-1.npz"),
+        (_plain_array, "trunks-1.npz"),
+        (_compressed, "trunks-1.npz"),
+        (_flags(method=0, encrypted=1), "trunks-1.npz"),
+        (_flags(method=99, encrypted=0), "trunks-1.npz"),
+        (_flags(method=8, encrypted=0), "trunks-1.npz"),
+        (_members(points=_npy(_HUGE)), "trunks-1.npz"),
+        (_members(points=_npy("{'descr': '<i4', 'shape': ((((")), "trunks-1.npz"),
+        (_members(points=_npy("{'descr': '<i4', 'fortran_order': False, 'shape': (), }", b"0000")), "trunks-1.npz"),
+        (_members(points=b"no array"), "trunks-1.npz"),
+        (
+            _edited(source={"path": "p", "relative_path": None, "used": [], "n_points": 10**14, "fingerprint": ""}),
+            "n_p",
+        ),
+        (_edited(next_id=2**31 + 1), "next_id"),
+        (_edited(trees={"2": {"tree_id": 2**31}}), "tree_id"),
+        (_edited(trees={"2": {"note": "\ud800"}}), "note"),
     ],
 )
 def test_a_damaged_plot_is_named_and_left_as_it_is(tmp_path, damage, words):
@@ -361,6 +430,80 @@ def test_a_plot_moved_together_with_its_cloud_finds_it(tmp_path):
     written(old / "plot.dbh", make_state(old))
     shutil.move(old, tmp_path / "new")
     assert read_project(tmp_path / "new" / "plot.dbh").source_path == tmp_path / "new" / "plot.ply"
+
+
+def test_a_reader_beside_a_writer_sees_one_whole_state(tmp_path, monkeypatch):
+    """The trunks it was told of go between its two looks: it looks again, as often as that happens."""
+    folder = tmp_path / "plot.dbh"
+    writer = ProjectWriter(folder)
+    states = [make_state(tmp_path, n_trunks=n) for n in (1, 2, 3)]
+    writer.save(states[0])
+    later = iter(states[1:])
+    parse = project._parse
+
+    def then_written(path):
+        saved = parse(path)
+        for state in itertools.islice(later, 1):
+            writer.save(state)
+        return saved
+
+    monkeypatch.setattr(project, "_parse", then_written)
+    assert same(read_project(folder), states[2])
+    writer.close()
+
+
+def test_another_file_of_the_same_name_beside_the_plot_does_not_hide_the_old_place(tmp_path):
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "plot.ply").write_text(name)
+    written(tmp_path / "old" / "plot.dbh", make_state(tmp_path / "old"))
+    shutil.move(tmp_path / "old" / "plot.dbh", tmp_path / "new" / "plot.dbh")
+    state = read_project(tmp_path / "new" / "plot.dbh")
+    assert state.source_path == tmp_path / "new" / "plot.ply"
+    assert state.other_source_path == tmp_path / "old" / "plot.ply"
+    (tmp_path / "new" / "plot.ply").unlink()
+    state = read_project(tmp_path / "new" / "plot.dbh")
+    assert state.source_path == tmp_path / "old" / "plot.ply" and state.other_source_path is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links and pipes are POSIX")
+@pytest.mark.parametrize("name", ["lock", "history.jsonl"])
+def test_a_link_or_pipe_in_a_plot_somebody_sent_is_refused_and_what_it_leads_to_left_alone(tmp_path, name):
+    folder = tmp_path / "plot.dbh"
+    written(folder, make_state(tmp_path))
+    (folder / name).unlink(missing_ok=True)
+
+    def use() -> None:
+        writer = ProjectWriter(folder)
+        try:
+            writer.log([{"what": "edit"}])
+        finally:
+            writer.close()
+
+    victim, absent = tmp_path / "victim", tmp_path / "absent"
+    victim.write_text("precious")
+    for target in (victim, absent):
+        (folder / name).symlink_to(target)
+        with pytest.raises(ProjectError, match="link"):
+            use()
+        (folder / name).unlink()
+    assert victim.read_text() == "precious" and not absent.exists()
+    os.mkfifo(folder / name)
+    with pytest.raises(ProjectError, match="not a regular file"):
+        use()
+
+
+def test_the_history_of_a_replaced_plot_is_put_aside(tmp_path):
+    folder = tmp_path / "plot.dbh"
+    writer = ProjectWriter(folder)
+    writer.put_history_aside()
+    for number in range(3):
+        writer.log([{"what": str(number)}])
+        writer.put_history_aside()
+    writer.close()
+    assert not (folder / "history.jsonl").exists()
+    kept = {path.name: json.loads(path.read_text())["what"] for path in folder.glob("history*")}
+    assert kept == {"history-1.jsonl": "0", "history-2.jsonl": "1", "history-3.jsonl": "2"}
 
 
 def test_the_history_is_appended_line_by_line_also_after_a_line_was_cut_off(tmp_path):

@@ -87,15 +87,17 @@ class Autosave:
         self._condition = threading.Condition()
         self._saving = threading.Lock()
         self._entries: list[dict[str, str]] = []
-        self._is_due = self._has_news = self._is_closing = False
+        self._has_news = self._is_closing = False
+        # The Document on disk, by identity; None where there is none yet.
+        self._saved: Document | None = None if is_new else session.document
         self._status = SaveStatus("saved")
         self._listeners: list[Callable[[SaveStatus], None]] = []
         self._thread: threading.Thread | None = None
         if is_new:
             self._entries.append(self._entry(label))
-            self._is_due = True
-            self._save_due()
+        # Before the first save: a command that comes while it runs is saved next.
         self._unsubscribe = session.subscribe(self._on_change)
+        self._save_due()
         session.saver = self
         atexit.register(self.close)
         if background:
@@ -127,11 +129,14 @@ class Autosave:
         self._save_due()
         return self._status.state == "saved"
 
-    def close(self) -> None:
-        """Save what is left and release the folder. Also done when the program ends."""
+    def close(self) -> SaveStatus:
+        """Save what is left and release the folder; whether it could be saved, which is logged where it could not.
+
+        Also done when the program ends.
+        """
         atexit.unregister(self.close)
         if self._is_closing:
-            return
+            return self._status
         self._unsubscribe()
         with self._condition:
             self._is_closing = True
@@ -141,11 +146,14 @@ class Autosave:
             self._thread = None
         self._save_due()
         self._writer.close()
+        if self._status.state == "not_saved":
+            _log.error("%s lacks the last changes. %s", self.folder.name, self._status.problem)
+        return self._status
 
     def _on_change(self, change: Change) -> None:
         with self._condition:
             self._entries.append(self._entry(change.label))
-            self._is_due = self._has_news = True
+            self._has_news = True
             self._condition.notify()
         if self._thread is None:
             self._save_due()
@@ -161,30 +169,30 @@ class Autosave:
             self._save_due()
 
     def _save_due(self) -> None:
-        """Save the Document as it is now, if the one on disk is another."""
+        """Save the Document as it is now, unless it is the one on disk and the history is complete."""
         with self._saving:
             with self._condition:
-                if not self._is_due:
-                    return
                 entries, self._entries = self._entries, []
-                self._is_due = False
                 document, next_id = self._session.document, self._session.next_id
+            if document is self._saved and not entries:
+                return
             self._set_status(SaveStatus("saving"))
             try:
                 self._writer.save(state_from_document(document), next_id=next_id)
+                self._saved = document
                 self._writer.log(entries)
             except ProjectError as error:
-                self._keep_due(entries, str(error))
+                self._keep_entries(entries, str(error))
             except Exception as error:  # noqa: BLE001 - the session must live on, and the person must hear of it
                 _log.exception("Saving failed")
-                self._keep_due(entries, f"The plot could not be saved ({error}).")
+                self._keep_entries(entries, f"The plot could not be saved ({error}).")
             else:
                 self._set_status(SaveStatus("saved"))
 
-    def _keep_due(self, entries: list[dict[str, str]], problem: str) -> None:
+    def _keep_entries(self, entries: list[dict[str, str]], problem: str) -> None:
+        """Keep what the history lacks, so that the next call saves."""
         with self._condition:
             self._entries = entries + self._entries
-            self._is_due = True
         self._set_status(SaveStatus("not_saved", problem))
 
     def _set_status(self, status: SaveStatus) -> None:

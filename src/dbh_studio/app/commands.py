@@ -5,6 +5,7 @@ A command that cannot be applied raises `CommandError` and changes nothing.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbh_studio.app.document import Direction, Document, unit_direction
-from dbh_studio.core.inventory import TreeRecord
+from dbh_studio.core.arrays import Int32
+from dbh_studio.core.inventory import TreeRecord, check_text
 from dbh_studio.core.scale import ScaleEstimate
-from dbh_studio.core.trunks import Trunk, TrunkSet
+from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
 from dbh_studio.errors import CommandError, SettingError
 
 # A detection that shares more than this part of its points with an old trunk is that trunk, found again. Above one half
@@ -43,6 +45,10 @@ def rename_plot(plot_id: str) -> Command:
     def apply(document: Document) -> Document:
         if not name:
             raise CommandError("A plot needs a name.", "Type at least one letter or digit.")
+        try:
+            check_text("the name", name)
+        except ValueError as error:
+            raise CommandError(f"The plot cannot be called this: {error}.") from None
         return document if name == document.plot_id else replace(document, plot_id=name)
 
     return Command(f"Rename the plot to {name}", apply)
@@ -92,8 +98,9 @@ def change_settings(section: str, **values: Any) -> Command:
 def replace_trunks(trunks: TrunkSet, *, label: str = "") -> Command:
     """Put newly found trunks in place of all there are.
 
-    A new trunk that is an old one found again keeps its id and what was said about it; the others get new ids. In a
-    plot that never had a trunk the given ids are kept, so that a file's own tree numbers stay.
+    A new trunk that is an old one found again keeps its id and what was said about it. One from the file keeps the
+    file's number, unless that is the number of another trunk that is present. The others get new ids; but in a plot
+    that never had a trunk the given ids are kept.
     """
 
     def apply(document: Document) -> Document:
@@ -182,18 +189,26 @@ def _check_free(trunks: TrunkSet, wanted: Trunk) -> None:
 
 
 def _renumbered(trunks: TrunkSet, document: Document) -> TrunkSet:
-    """The trunks with the ids of the old trunks they are, and new ids for the others, in the order given."""
+    """The trunks with the ids they keep (see `replace_trunks`), and new ids for the others, in the order given."""
     old = document.trunks
     old_labels = old.labels(document.source.n_points)
-    new_id, numbered = old.next_id, []
-    for trunk in trunks:
-        labels, counts = np.unique(old_labels[trunk.points], return_counts=True)
-        counts[labels == 0] = 0
-        candidate, n_shared = int(labels[counts.argmax()]), int(counts.max())
-        n_union = len(trunk) + (len(old[candidate]) if candidate else 0) - n_shared
-        if candidate and n_shared > _SAME_TRUNK_IOU * n_union:
-            numbered.append(replace(trunk, id=candidate))
-        else:
-            numbered.append(replace(trunk, id=new_id))
-            new_id += 1
-    return TrunkSet(tuple(numbered), new_id)
+    kept = [
+        _found_again(trunk, old, old_labels) or (trunk.id if trunk.origin == "file" and trunk.id not in old else None)
+        for trunk in trunks
+    ]
+    first_new = max([old.next_id, *(trunk_id + 1 for trunk_id in kept if trunk_id is not None)])
+    next_id = first_new + kept.count(None)
+    if next_id > MAX_TRUNK_ID + 1:
+        raise CommandError("There are not enough numbers left for the new trunks.", "Begin a new plot from the cloud.")
+    new_ids = itertools.count(first_new)
+    ids = (next(new_ids) if trunk_id is None else trunk_id for trunk_id in kept)
+    return TrunkSet(tuple(replace(trunk, id=i) for trunk, i in zip(trunks, ids, strict=True)), next_id)
+
+
+def _found_again(trunk: Trunk, old: TrunkSet, old_labels: Int32) -> int | None:
+    """The id of the old trunk that `trunk` is."""
+    labels, counts = np.unique(old_labels[trunk.points], return_counts=True)
+    counts[labels == 0] = 0
+    candidate, n_shared = int(labels[counts.argmax()]), int(counts.max())
+    n_union = len(trunk) + (len(old[candidate]) if candidate else 0) - n_shared
+    return candidate if candidate and n_shared > _SAME_TRUNK_IOU * n_union else None

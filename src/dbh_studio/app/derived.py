@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from dbh_studio.app.document import Document
+from dbh_studio.app.threads import map_in_threads
 from dbh_studio.core.arrays import Float32, readonly
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import Inventory, InventoryRow, MapPosition, inventory_row
@@ -113,29 +114,49 @@ class Derived:
         self._lock = threading.RLock()
         self._points: _Recent[Float32] = _Recent(1)
         self._grounds: _Recent[GroundModel] = _Recent(_N_GROUNDS)
+        self._under_way: dict[tuple[object, Hashable], threading.Event] = {}
         self._stems: WeakKeyDictionary[Trunk, _Recent[StemMeasurement]] = WeakKeyDictionary()
         self._inventory: tuple[Document, Inventory] | None = None
         self._map_system: tuple[bool, int | None] | None = None
 
     def points_world(self, document: Document) -> Float32:
         """(N, 3) float32 points of the cloud in the world frame, read-only."""
-        with self._lock:
-            key = _frame_key(document)
-            points = self._points.get(key)
-            if points is None:
-                points = self._points.put(key, transformed(self._cloud, document.world_from_source))
-            return points
+        return self._once(
+            self._points, _frame_key(document), lambda: transformed(self._cloud, document.world_from_source)
+        )
 
     def ground(self, document: Document, progress: Progress = ignore_progress) -> GroundModel:
         """The ground under the stems."""
-        with self._lock:
-            key = _ground_key(document)
-            ground = self._grounds.get(key)
-            if ground is not None:
-                return ground
+
+        def fit() -> GroundModel:
             fit_ground = self._fit_ground or _default_fit_ground()
-            points = self.points_world(document)
-            return self._grounds.put(key, fit_ground(points, settings=document.settings.ground, progress=progress))
+            return fit_ground(self.points_world(document), settings=document.settings.ground, progress=progress)
+
+        return self._once(self._grounds, _ground_key(document), fit)
+
+    def _once(self, recent: _Recent[Value], key: Hashable, compute: Callable[[], Value]) -> Value:
+        """The value of `key`; where several threads ask, one computes, without the lock, and the others wait for it.
+
+        Where that one fails or is cancelled, another computes.
+        """
+        while True:
+            with self._lock:
+                value = recent.get(key)
+                if value is not None:
+                    return value
+                under_way = self._under_way.get((recent, key))
+                if under_way is None:
+                    done = self._under_way[recent, key] = threading.Event()
+                    break
+            under_way.wait()
+        try:
+            value = compute()
+            with self._lock:
+                return recent.put(key, value)
+        finally:
+            with self._lock:
+                del self._under_way[recent, key]
+            done.set()
 
     def has_ground(self, document: Document) -> bool:
         """Whether `ground` answers at once."""
@@ -182,12 +203,13 @@ class Derived:
 
     def measurements(self, document: Document, progress: Progress = ignore_progress) -> tuple[StemMeasurement, ...]:
         """All stems, in order of id."""
-        done = []
-        for i, trunk_id in enumerate(document.trunks.ids):
-            progress(i / len(document.trunks), f"Measuring stem {i + 1} of {len(document.trunks)}")
-            done.append(self.measurement(document, trunk_id))
+        ids = document.trunks.ids
+        missing = [i for i in ids if self.known_measurement(document, i) is None] if document.scale.is_known else []
+        progress(0.0, "Measuring the stems")
+        for n_done, _ in enumerate(map_in_threads(lambda i: self.measurement(document, i), missing), start=1):
+            progress(n_done / len(missing), f"Measured {n_done} of {len(missing)} stems")
         progress(1.0, "")
-        return tuple(done)
+        return tuple(self.measurement(document, i) for i in ids)
 
     def inventory(self, document: Document, progress: Progress = ignore_progress) -> Inventory:
         """One row per stem."""

@@ -15,8 +15,15 @@ from dbh_studio.app.session import Session
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
 from dbh_studio.core.transforms import UP_AXES
-from dbh_studio.errors import FileMissingError, ProjectError, SettingError
-from dbh_studio.io.project import PROJECT_FILE, ProjectWriter, is_project, read_project
+from dbh_studio.errors import (
+    FileError,
+    FileMissingError,
+    ProjectError,
+    ProjectExistsError,
+    ProjectMismatchError,
+    SettingError,
+)
+from dbh_studio.io.project import PROJECT_FILE, PlotState, ProjectWriter, is_project, read_project
 
 if TYPE_CHECKING:
     from dbh_studio.core.datacheck import DataCheck
@@ -37,28 +44,41 @@ _UNITS: dict[str, tuple[float, ScaleSource]] = {
     "millimetres": (0.001, "millimetres"),
     "mm": (0.001, "millimetres"),
 }
+# From micrometres to a reconstruction whose unit is ten kilometres: beyond it somebody slipped on the keyboard.
+_LEAST_SCALE, _MOST_SCALE = 1e-6, 1e4
 
 
 def scale_from(value: float | str | ScaleEstimate | None) -> ScaleEstimate:
     """A scale as a person gives it: metres per unit, the name of a unit, or ``unknown``.
 
     Raises:
-        SettingError: It is none of these, or not positive.
+        SettingError: It is none of these, not positive, or beyond reason.
     """
     if isinstance(value, ScaleEstimate):
-        return value
+        return _reasonable(value)
     if value is None or value == "unknown":
         return ScaleEstimate()
     if isinstance(value, str) and value.lower() in _UNITS:
         metres_per_unit, source = _UNITS[value.lower()]
         return ScaleEstimate(metres_per_unit, source)
     try:
-        return ScaleEstimate(float(value), "factor")
+        scale = ScaleEstimate(float(value), "factor")
     except ValueError:
         names = ", ".join(_UNITS)
         raise SettingError(
             f"The scale {value!r} was not understood.", f"Give metres per unit, such as 1.332, or one of: {names}."
         ) from None
+    return _reasonable(scale)
+
+
+def _reasonable(scale: ScaleEstimate) -> ScaleEstimate:
+    """The same scale. Raises SettingError where no cloud can have it, before it overflows what is computed with it."""
+    if _LEAST_SCALE <= scale.metres_per_unit <= _MOST_SCALE:
+        return scale
+    raise SettingError(
+        f"{scale.metres_per_unit:g} metres per unit is beyond reason.",
+        f"Give {_LEAST_SCALE:g} to {_MOST_SCALE:,.0f} metres per unit, or the name of a unit such as metres.",
+    )
 
 
 @dataclass(frozen=True)
@@ -98,8 +118,8 @@ def open_plot(
 
     Raises:
         FileError: The cloud cannot be read, or is not where the saved plot says.
-        ProjectError: The saved plot is damaged, locked, newer, or of another cloud.
-        SettingError: `scale` or `up` is not understood.
+        ProjectError: The saved plot is damaged, locked, newer, or of another cloud (`ProjectMismatchError`).
+        SettingError: `scale` or `up` is not understood, or the scale is given for degrees.
     """
     path = Path(path)
     wish = _Wish(None if scale is None else scale_from(scale), None if up is None else _up_from(up))
@@ -142,14 +162,40 @@ def save_as(
         label: What the history says of it.
 
     Raises:
-        ProjectError: There is a saved plot already, or the folder cannot be written.
+        ProjectExistsError: There is a saved plot already.
+        ProjectError: The folder cannot be written; the plot is kept where it was.
     """
     folder = Path(folder)
-    if (folder / PROJECT_FILE).exists() and not overwrite:
-        raise ProjectError(f"There is a saved plot in {folder.name} already.", "Choose another name, or open that one.")
+    if not overwrite:
+        _check_is_new(folder)
     writer = ProjectWriter(folder)
-    session.close()
-    return Autosave(session, writer, background=background, label=label)
+    try:
+        # Again, now that nobody else can write it: two processes may have come this far at once.
+        if not overwrite:
+            _check_is_new(folder)
+        writer.put_history_aside()
+    except ProjectError:
+        writer.close()
+        raise
+    # The old one goes on until the new one has saved, so that no edit is between the two.
+    before = session.saver
+    saver = Autosave(session, writer, background=background, label=label)
+    if saver.status.state == "not_saved":
+        problem = saver.status.problem
+        saver.close()
+        session.saver = before
+        raise ProjectError(problem)
+    if before is not None:
+        before.close()
+    return saver
+
+
+def _check_is_new(folder: Path) -> None:
+    if (folder / PROJECT_FILE).exists():
+        raise ProjectExistsError(
+            f"There is a saved plot {folder.name} already, perhaps with edits.",
+            "Choose another name, or open that one.",
+        )
 
 
 def _up_from(up: str | Direction) -> Direction:
@@ -167,7 +213,13 @@ def read_cloud(path: Path, *, progress: Progress = ignore_progress) -> Reconstru
 
 
 def _open_new(path: Path, wish: _Wish, read: Reader, *, read_only: bool, progress: Progress) -> Session:
+    _check_name(path)
     reconstruction = read(path, progress=subprogress(progress, 0.0, 0.8))
+    if reconstruction.provenance.is_geographic and wish.scale is not None and wish.scale.is_known:
+        raise SettingError(
+            f"The coordinates of {path.name} are degrees of longitude and latitude, which no scale turns into metres.",
+            "Convert the cloud to a projected system (UTM, or the national grid) first.",
+        )
     progress(0.8, "Looking at the data")
     check = _check(reconstruction, wish)
     document = Document(
@@ -178,6 +230,14 @@ def _open_new(path: Path, wish: _Wish, read: Reader, *, read_only: bool, progres
     )
     progress(1.0, "")
     return _session(reconstruction, document, check, read_only)
+
+
+def _check_name(path: Path) -> None:
+    """Raise FileError where the path is no text, for then neither a saved plot nor a table can name it."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise FileError(path, "Its name, or that of a folder it is in, is not UTF-8.", "Rename it.") from None
 
 
 def _check(reconstruction: Reconstruction, wish: _Wish) -> DataCheck:
@@ -238,16 +298,17 @@ def _reopen(
                 f"The cloud of the saved plot {folder.name} is not there any more ({path}).",
                 "Put it back, or say where it is now.",
             )
-        reconstruction = read(path, progress=subprogress(progress, 0.0, 0.8))
-        info = SourceInfo.of(reconstruction.cloud, path, reconstruction.used)
-        if (info.n_points, info.fingerprint) != (state.n_points, state.fingerprint):
-            raise _other_cloud(folder, path, state.n_points, info.n_points)
+        reconstruction, info = _read_source_of(
+            state, (path, None if source is not None else state.other_source_path), folder, read, progress
+        )
         document = document_from_state(state, info)
         check = _check(reconstruction, _Wish(document.scale, document.up_direction))
         session = _session(reconstruction, document, check, read_only)
         if writer is not None:
             writer.adopt(state)
-            Autosave(session, writer, background=background, is_new=False)
+            # A new place is told to the saved plot at once: the next program may not be told.
+            has_moved = info.path != state.source_path
+            Autosave(session, writer, background=background, is_new=has_moved, label=f"Find the cloud at {info.path}")
     except BaseException:
         if writer is not None:
             writer.close()
@@ -256,9 +317,26 @@ def _reopen(
     return session
 
 
-def _other_cloud(folder: Path, path: Path, n_saved: int, n_found: int) -> ProjectError:
+def _read_source_of(
+    state: PlotState, paths: tuple[Path, Path | None], folder: Path, read: Reader, progress: Progress
+) -> tuple[Reconstruction, SourceInfo]:
+    """The cloud the plot was made from, at the first of `paths` or else at the second.
+
+    Raises:
+        ProjectMismatchError: It is at neither; speaks of the first.
+    """
+    found: list[SourceInfo] = []
+    for path in filter(None, paths):
+        reconstruction = read(path, progress=subprogress(progress, 0.4 * len(found), 0.8))
+        found.append(SourceInfo.of(reconstruction.cloud, path, reconstruction.used))
+        if (found[-1].n_points, found[-1].fingerprint) == (state.n_points, state.fingerprint):
+            return reconstruction, found[-1]
+    raise _other_cloud(folder, found[0].path, state.n_points, found[0].n_points)
+
+
+def _other_cloud(folder: Path, path: Path, n_saved: int, n_found: int) -> ProjectMismatchError:
     difference = f"it has {n_found:,} points instead of {n_saved:,}" if n_found != n_saved else "its points are others"
-    return ProjectError(
+    return ProjectMismatchError(
         f"{path.name} is not the cloud that the saved plot {folder.name} was made from: {difference}.",
-        "Its trunks were not put on it. Put the original file back, or open this one as a new plot.",
+        f"Its trunks were not put on it. Put the original file back, or move {folder.name} away to begin anew.",
     )

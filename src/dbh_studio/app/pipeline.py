@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,12 +19,13 @@ from dbh_studio.app.document import Direction, Document
 from dbh_studio.app.jobs import run_job
 from dbh_studio.app.opening import open_plot, plot_name, save_as, scale_from
 from dbh_studio.app.session import Session
+from dbh_studio.app.threads import map_in_threads
 from dbh_studio.core.arrays import Float32
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import Trunk, TrunkSet
-from dbh_studio.errors import ProjectError
-from dbh_studio.io.inventory_csv import write_inventory_csv
+from dbh_studio.errors import ProjectError, ProjectExistsError
+from dbh_studio.io.inventory_csv import check_absent, check_not_source, check_replaceable, write_inventory_csv
 from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
 from dbh_studio.settings import GroundSettings, MeasureSettings, Settings
 
@@ -49,6 +51,9 @@ __all__ = [
 # What a segmentation depends on; a job that ran while one of them changed is stale. Of the measurement it reads only
 # how many points are too few and the seed, which are no reason to throw away minutes of work.
 SEGMENTATION_READS = ("source", "up_direction", "scale", "settings.ground", "settings.trunks", "trunks")
+
+# Bytes. File systems allow 255, and what is written beside adds a suffix and a process number.
+_LONGEST_NAME = 180
 
 SegmentationResult = tuple["GroundModel", TrunkSet, tuple[str, ...]]
 
@@ -171,10 +176,14 @@ def measure_stems(
     """Measure many stems, given as (id, (K, 3) points_world). Pure and picklable, for a job."""
     from dbh_studio.stages.measure import measure_trunk
 
-    measured = []
-    for i, (trunk_id, points_world) in enumerate(stems):
-        progress(i / len(stems), f"Measuring stem {i + 1} of {len(stems)}")
-        measured.append(measure_trunk(points_world, trunk_id=trunk_id, ground=ground, settings=settings))
+    def measure(stem: tuple[int, Float32]) -> StemMeasurement:
+        return measure_trunk(stem[1], trunk_id=stem[0], ground=ground, settings=settings)
+
+    measured: list[StemMeasurement] = []
+    progress(0.0, "Measuring the stems")
+    for stem in map_in_threads(measure, stems):
+        measured.append(stem)
+        progress(len(measured) / len(stems), f"Measured {len(measured)} of {len(stems)} stems")
     progress(1.0, "")
     return measured
 
@@ -229,8 +238,9 @@ def run_plot(
     *,
     scale: float | str | ScaleEstimate | None = None,
     up: str | Direction | None = None,
-    settings: Settings | None = None,
+    settings: Settings | Mapping[str, Mapping[str, Any]] | None = None,
     plot_id: str = "",
+    relocate: Path | str | None = None,
     overwrite: bool = False,
     in_process: bool = True,
     progress: Progress = ignore_progress,
@@ -240,44 +250,55 @@ def run_plot(
     A saved plot is measured where it is, with the trunks it has; trunks are looked for only if it has none.
 
     Args:
-        settings: Instead of the defaults, or of those the saved plot has.
+        settings: Instead of the defaults, or of those the saved plot has; as section -> name -> value, only the named
+            ones are changed.
         plot_id: What to call the plot; the file's name by default.
-        overwrite: Replace a plot that an earlier run left in `out_dir`. Edits made in it are lost.
+        relocate: Where the cloud of a saved plot is now.
+        overwrite: Replace a plot that an earlier run left in `out_dir`, and ``NAME.csv``. Edits made in them are lost.
         in_process: Work here rather than in a child process.
 
     Raises:
         UnscaledCloudError: The data does not tell its unit and no scale was given.
-        ProjectError: `out_dir` has such a plot already and `overwrite` is False.
+        ProjectExistsError: `out_dir` has such a plot already and `overwrite` is False.
+        ProjectError: `out_dir` cannot be written; told before the work is done.
+        FileError: ``NAME.csv`` is what the plot is read from, or was not written by this plot and `overwrite` is False.
         StudioError: What `open_plot` and the stages raise.
     """
     path, out_dir = Path(path), Path(out_dir)
-    name = re.sub(r'[\\/:*?"<>|]+', "_", plot_id or plot_name(path)).strip(". ") or "plot"
+    name = _file_name(plot_id or plot_name(path))
     is_saved = is_project(path)
     project_dir = path if is_saved else out_dir / f"{name}{FOLDER_SUFFIX}"
     if not is_saved and not overwrite and (project_dir / PROJECT_FILE).exists():
-        raise ProjectError(
+        raise ProjectExistsError(
             f"There is a saved plot {project_dir.name} from an earlier run, perhaps with edits.",
             "Run on it to measure it again, choose another folder, or say that it may be overwritten.",
         )
+    csv_path = out_dir / f"{name}.csv"
+    _check_table(csv_path, path, is_saved=is_saved, overwrite=overwrite)
+    _check_writable(out_dir)
     timings_s: dict[str, float] = {}
     with _timed(timings_s, "read"):
         part = subprogress(progress, 0.0, 0.3)
-        session = open_plot(path, scale=scale, up=up, background_save=False, progress=part)
+        session = open_plot(path, scale=scale, up=up, relocate=relocate, background_save=False, progress=part)
     try:
+        # Only now are the files of a folder known, and where a saved plot found its cloud.
+        check_not_source(csv_path, session.document.source.used)
         _configure(session, settings, plot_id)
         session.require_scale()
         notes = [*session.notes]
         if not len(session.document.trunks):
             with _timed(timings_s, "ground and trunks"):
                 notes += segment(session, progress=subprogress(progress, 0.3, 0.7), in_process=in_process)
+        elif is_saved:
+            notes.append(f"The trunks are those the plot was saved with ({len(session.document.trunks)}).")
         with _timed(timings_s, "diameters"):
             inventory = session.inventory(subprogress(progress, 0.7, 0.99))
         with _timed(timings_s, "write"):
             if not is_saved:
                 label = f"Create the plot and find {len(inventory)} trunks"
                 save_as(session, project_dir, overwrite=overwrite, background=False, label=label)
-            csv_path = write_inventory_csv(out_dir / f"{name}.csv", inventory)
-            _flush(session)
+            write_inventory_csv(csv_path, inventory)
+            session.flush()
     except BaseException:
         session.close()
         raise
@@ -294,15 +315,39 @@ def _timed(timings_s: dict[str, float], step: str) -> Iterator[None]:
     timings_s[step] = time.perf_counter() - start
 
 
-def _configure(session: Session, settings: Settings | None, plot_id: str) -> None:
+def _file_name(plot_id: str) -> str:
+    """A plot's name as that of a file: portable, and short enough for what is put around it."""
+    name = re.sub(r'[\x00-\x1f\x7f\\/:*?"<>|]+', "_", plot_id).strip(". ")
+    return name.encode("utf-8", "replace")[:_LONGEST_NAME].decode("utf-8", "ignore").rstrip(". ") or "plot"
+
+
+def _check_table(csv_path: Path, path: Path, *, is_saved: bool, overwrite: bool) -> None:
+    """Raise FileError where the table of a run would take the place of something that cannot be had again."""
+    if not path.is_dir():
+        check_not_source(csv_path, [path])
+    if overwrite:
+        return
+    # A saved plot writes its table again; one that is yet to be made has none.
+    if is_saved:
+        check_replaceable(csv_path)
+    else:
+        check_absent(csv_path)
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise ProjectError unless `folder` can be written or made; makes nothing."""
+    above = (folder.absolute(), *folder.absolute().parents)
+    # os.path, not pathlib: that one raises where a folder may not be entered.
+    existing = next(path for path in above if os.path.exists(path))  # noqa: PTH110
+    problem = "" if os.access(existing, os.W_OK | os.X_OK) else "permission denied"
+    problem = problem if os.path.isdir(existing) else f"{existing.name} is not a folder"  # noqa: PTH112
+    if problem:
+        raise ProjectError(f"The folder {folder} cannot be written ({problem}).", "Choose another folder.")
+
+
+def _configure(session: Session, settings: Settings | Mapping[str, Mapping[str, Any]] | None, plot_id: str) -> None:
     if plot_id:
         session.do(rename_plot(plot_id))
-    if settings is not None:
-        for section in type(settings).model_fields:
-            session.do(change_settings(section, **getattr(settings, section).model_dump()))
-
-
-def _flush(session: Session) -> None:
-    saver = session.saver
-    if saver is not None and not saver.flush():
-        raise ProjectError(saver.status.problem)
+    changes = settings.model_dump() if isinstance(settings, Settings) else settings or {}
+    for section, values in changes.items():
+        session.do(change_settings(section, **values))

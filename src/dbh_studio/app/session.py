@@ -16,7 +16,7 @@ from dbh_studio.core.arrays import Float32
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import Inventory
 from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.errors import CommandError, StaleResultError, UnscaledCloudError
+from dbh_studio.errors import CommandError, ProjectError, StaleResultError, UnscaledCloudError
 
 if TYPE_CHECKING:
     from dbh_studio.app.autosave import Autosave
@@ -314,8 +314,20 @@ class Session:
         if not (document or self._document).scale.is_known:
             raise UnscaledCloudError(UNSCALED_REASON, UNSCALED_REMEDY)
 
+    def flush(self) -> None:
+        """Save what is not saved, now, where the plot is kept in a folder.
+
+        Raises:
+            ProjectError: It could not be saved; says why.
+        """
+        if self.saver is not None and not self.saver.flush():
+            raise ProjectError(self.saver.status.problem)
+
     def close(self) -> None:
-        """Save what is left and release the saved plot. The Session must not be used afterwards."""
+        """Save what is left and release the saved plot. The Session must not be used afterwards.
+
+        A last save that fails is logged; where the caller can still do something about it, `flush` comes first.
+        """
         saver, self.saver = self.saver, None
         if saver is not None:
             saver.close()

@@ -13,6 +13,7 @@ import numpy as np
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.trunks import MAX_TRUNK_ID
 
 # `core.dbh` needs scipy, which takes a second to import; the saved plot needs only `TreeRecord` from here.
 if TYPE_CHECKING:
@@ -44,12 +45,25 @@ class TreeRecord:
 
     def __post_init__(self) -> None:
         for name in ("species", "note", "tag"):
-            if not isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} is {getattr(self, name)!r} but must be text")
+            check_text(name, getattr(self, name))
         if self.status not in TREE_STATUSES:
             raise ValueError(f"status is {self.status!r} but must be one of {TREE_STATUSES}")
-        if self.tree_id is not None and self.tree_id <= 0:
-            raise ValueError(f"tree id is {self.tree_id} but must be positive")
+        if not isinstance(self.edited, bool):
+            raise ValueError(f"edited is {self.edited!r} but must be True or False")
+        if self.tree_id is not None:
+            is_whole = isinstance(self.tree_id, int) and not isinstance(self.tree_id, bool)
+            if not (is_whole and 0 < self.tree_id <= MAX_TRUNK_ID):
+                raise ValueError(f"tree id is {self.tree_id!r} but must be a number from 1 to {MAX_TRUNK_ID}")
+
+
+def check_text(name: str, text: object) -> None:
+    """Raise ValueError unless `text` is one that a file can hold: half of a surrogate pair would stop all saving."""
+    if not isinstance(text, str):
+        raise ValueError(f"{name} is {text!r} but must be text")
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{name} is {text!r} but must be text that can be written as UTF-8") from None
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from dbh_studio.core.arrays import Int32, readonly
 
+# Labels of points and the saved plot hold ids as int32.
+MAX_TRUNK_ID = 2**31 - 1
+
 
 @dataclass(frozen=True, eq=False)
 class Trunk:
     """One stem.
 
     Attributes:
-        id: Positive, never reused within a plot.
+        id: From 1 to `MAX_TRUNK_ID`, never reused within a plot.
         points: (K,) sorted, unique indices into the plot's cloud.
         origin: Where it came from: ``geometry``, ``file``, ``masks`` or ``hand``.
     """
@@ -28,8 +31,8 @@ class Trunk:
     origin: str = "geometry"
 
     def __post_init__(self) -> None:
-        if self.id <= 0:
-            raise ValueError(f"trunk id is {self.id} but must be positive")
+        if not 0 < self.id <= MAX_TRUNK_ID:
+            raise ValueError(f"trunk id is {self.id} but must be positive and at most {MAX_TRUNK_ID}")
         points = np.asarray(self.points, np.int32)
         if points.ndim != 1 or (len(points) > 1 and not (np.diff(points) > 0).all()):
             raise ValueError(f"points of trunk {self.id} must be a sorted, unique (K,) array")
@@ -45,7 +48,7 @@ class TrunkSet:
 
     Attributes:
         trunks: In order of id.
-        next_id: The id the next new trunk gets; grows only.
+        next_id: The id the next new trunk gets; grows only, to one above `MAX_TRUNK_ID` where there is none left.
     """
 
     trunks: tuple[Trunk, ...] = ()
@@ -58,6 +61,8 @@ class TrunkSet:
             raise ValueError("two trunks have the same id")
         object.__setattr__(self, "trunks", tuple(sorted(self.trunks, key=lambda trunk: trunk.id)))
         object.__setattr__(self, "next_id", max([self.next_id, *(i + 1 for i in by_id)]))
+        if self.next_id > MAX_TRUNK_ID + 1:
+            raise ValueError(f"next id is {self.next_id} but must be at most {MAX_TRUNK_ID + 1}")
         object.__setattr__(self, "_by_id", MappingProxyType(by_id))
 
     def __reduce__(self) -> tuple[Any, ...]:

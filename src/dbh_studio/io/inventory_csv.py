@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import csv
 import io
+import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +33,10 @@ _DECIMALS = {
     "northing": 3,
 }
 
-# OWASP, "CSV injection": these start a formula in Excel, LibreOffice and Google Sheets.
-_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\n", "＝", "＋", "－", "＠")
+# OWASP, "CSV injection": these start a formula in Excel, LibreOffice and Google Sheets, at the start of a cell. Where
+# the decimal sign is a comma, a spreadsheet divides at semicolons and takes the quotes around our cell for letters:
+# there a cell also starts behind a semicolon, a tab or a line feed, and its own quotes are opened by one in the text.
+_FORMULA_START = re.compile(r"\A(?=[=+\-@\t\n＝＋－＠])|(?<=[;\t\n|])(?=\"*[=+\-@＝＋－＠])")
 
 
 def _cell(column: str, value: Any) -> str:
@@ -47,7 +52,7 @@ def _cell(column: str, value: Any) -> str:
         return text.removeprefix("-") if float(text) == 0 else text
     # A NUL ends the text for many readers; a lone carriage return is a line end to some and is not quoted by csv.
     text = str(value).replace("\x00", "").replace("\r\n", "\n").replace("\r", "\n")
-    return f"'{text}" if text.startswith(_FORMULA_STARTS) else text
+    return _FORMULA_START.sub("'", text)
 
 
 def _cells(row: InventoryRow) -> list[str]:
@@ -88,15 +93,64 @@ def write_inventory_csv(path: Path | str, inventory: Inventory, *, bom: bool = F
     return path
 
 
+def check_not_source(path: Path, sources: Iterable[Path]) -> None:
+    """Raise FileError where writing `path` would destroy what a plot is read from.
+
+    Args:
+        path: The table to be written.
+        sources: Files, and folders whose files are read; they need not be there.
+    """
+    for source in sources:
+        folder_or_file = path.parent if os.path.isdir(source) else path  # noqa: PTH112 - pathlib's raises
+        if os.path.exists(path) and os.path.exists(source) and folder_or_file.samefile(source):  # noqa: PTH110
+            raise FileError(
+                path,
+                "The table would overwrite this file, and the plot is read from it.",
+                "Choose another name or folder for the table.",
+            )
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise FileError where there is a file at `path` that is no inventory, and so cannot be had again."""
+    if os.path.lexists(path) and not _is_inventory(path):
+        raise _exists(path)
+
+
+def check_absent(path: Path) -> None:
+    """Raise FileError where there is anything at `path`, even an inventory: it is not that of a plot to be made."""
+    if os.path.lexists(path):
+        raise _exists(path)
+
+
+def _exists(path: Path) -> FileError:
+    return FileError(
+        path,
+        "There is such a file already, and this plot did not write it.",
+        "Move it away, choose another name or folder, or say that it may be overwritten.",
+    )
+
+
+def _is_inventory(path: Path) -> bool:
+    """Whether it has the columns of an inventory in every line."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header, *rows = csv.reader(file, strict=True)
+    except (OSError, ValueError, csv.Error):
+        return False
+    return tuple(header) == COLUMNS and all(len(row) == len(COLUMNS) for row in rows)
+
+
 def projected_epsg(crs: str | None) -> tuple[bool, int | None]:
     """Whether `crs` is a projected (map) system, and the EPSG code of its horizontal part where it has one.
 
-    A system that cannot be understood is (False, None): no position is better than a wrong one.
+    A system that cannot be understood, or not without pyproj, is (False, None): no position is better than a wrong one.
     """
     if not crs:
         return False, None
-    import pyproj  # slow to import, and needed only for clouds with a coordinate reference system
-
+    try:
+        import pyproj  # slow to import, and needed only for clouds with a coordinate reference system
+    except ImportError:
+        return False, None
     try:
         parsed = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import IO
 
 from dbh_studio.errors import ProjectLockedError
+from dbh_studio.io.ownfile import open_own_file
 
 
 def lock_file(path: Path) -> IO[str]:
@@ -18,9 +19,9 @@ def lock_file(path: Path) -> IO[str]:
 
     Raises:
         ProjectLockedError: Another process holds it, or this one already does.
-        OSError: The file cannot be made, or its file system has no locks.
+        OSError: The file cannot be made, is a link, or its file system has no locks.
     """
-    file = path.open("a+", encoding="utf-8")
+    file = os.fdopen(open_own_file(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "a+", encoding="utf-8")
     try:
         _lock_or_fail(file)
     except BlockingIOError:

@@ -3,6 +3,7 @@
     project.json    everything but the points of the trunks; the one file that counts
     trunks-7.npz    the trunks project.json speaks of; an older or newer one is what a crash left, and is removed
     history.jsonl   what was done, by whom and when; for the record, never read by the program
+    history-1.jsonl the history of a plot that this one has replaced
     lock            held by the process that writes the plot
     cache/          may be deleted at any time
 
@@ -12,6 +13,7 @@ Each save writes a new trunks file (where trunks changed), then project.json in 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -19,17 +21,19 @@ import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from dbh_studio.core.inventory import TreeRecord
+from dbh_studio.core.inventory import TreeRecord, check_text
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
-from dbh_studio.core.trunks import Trunk, TrunkSet
+from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectVersionError
 from dbh_studio.io.atomic import atomic_file
 from dbh_studio.io.lock import lock_file
+from dbh_studio.io.ownfile import open_own_file
 from dbh_studio.settings import Settings
 
 SCHEMA_VERSION = 1
@@ -39,6 +43,18 @@ HISTORY_FILE = "history.jsonl"
 LOCK_FILE = "lock"
 
 _TRUNKS_FILE = re.compile(r"trunks-(\d+)\.npz")
+_TRUNK_ARRAYS = ("ids", "ends", "points", "origins")
+_MAX_POINTS = 2**31 - 1  # trunks are int32 indices
+# How often a reader beside a busy writer looks again before it gives up.
+_N_LOOKS = 10
+
+
+def _check_text(text: str) -> str:
+    check_text("it", text)
+    return text
+
+
+Text = Annotated[str, AfterValidator(_check_text)]
 
 
 class _Model(BaseModel):
@@ -48,11 +64,11 @@ class _Model(BaseModel):
 class SavedSource(_Model):
     """Where the cloud is; `relative_path` is from the saved plot, so that both may be moved together."""
 
-    path: str
-    relative_path: str | None
-    used: tuple[str, ...]
-    n_points: int = Field(ge=0)
-    fingerprint: str
+    path: Text
+    relative_path: Text | None
+    used: tuple[Text, ...]
+    n_points: int = Field(ge=0, le=_MAX_POINTS)
+    fingerprint: Text
 
 
 class SavedScale(_Model):
@@ -66,25 +82,25 @@ class SavedScale(_Model):
 class SavedTree(_Model):
     """A `TreeRecord`."""
 
-    species: str = ""
+    species: Text = ""
     status: Literal["live", "dead", ""] = ""
-    note: str = ""
-    tag: str = ""
+    note: Text = ""
+    tag: Text = ""
     edited: bool = False
-    tree_id: int | None = Field(None, gt=0)
+    tree_id: int | None = Field(None, gt=0, le=MAX_TRUNK_ID)
 
 
 class SavedProject(_Model):
     """project.json, schema version 1."""
 
     schema_version: Literal[1] = 1
-    plot_id: str
+    plot_id: Text
     source: SavedSource
     up_direction: tuple[float, float, float]
     scale: SavedScale
     settings: Settings
     trunks_file: str = Field(pattern=f"^{_TRUNKS_FILE.pattern}$")
-    next_id: int = Field(ge=1)
+    next_id: int = Field(ge=1, le=MAX_TRUNK_ID + 1)
     trees: dict[int, SavedTree]
 
     @field_validator("up_direction")
@@ -97,7 +113,12 @@ class SavedProject(_Model):
 
 @dataclass(frozen=True, eq=False)
 class PlotState:
-    """What a saved plot holds, in the program's own types. `source_path` is absolute."""
+    """What a saved plot holds, in the program's own types.
+
+    Attributes:
+        source_path: Where the cloud is, absolute: beside the plot as it was saved, or else where it was then.
+        other_source_path: Where it was then, if there is a file of its name at both places; only one is the cloud.
+    """
 
     plot_id: str
     source_path: Path
@@ -109,33 +130,38 @@ class PlotState:
     settings: Settings
     trunks: TrunkSet
     trees: Mapping[int, TreeRecord]
+    other_source_path: Path | None = None
 
 
 def is_project(path: Path | str) -> bool:
     """Whether `path` is a saved plot, or looks like one that has lost its project.json."""
     path = Path(path)
-    return path.is_dir() and (path.suffix == FOLDER_SUFFIX or (path / PROJECT_FILE).exists())
+    # os.path, not pathlib: that one raises where a name is too long or a folder may not be entered.
+    if not os.path.isdir(path):  # noqa: PTH112
+        return False
+    return path.suffix == FOLDER_SUFFIX or os.path.exists(path / PROJECT_FILE)  # noqa: PTH110
 
 
 # ---- reading
 
 
 def read_project(folder: Path | str) -> PlotState:
-    """Read a saved plot. Nothing is written, whatever is found.
+    """Read a saved plot, which another process may be writing. Nothing is written, whatever is found.
 
     Raises:
         ProjectVersionError: It was saved by a newer program.
         ProjectError: A file is missing or damaged; says which.
     """
     folder = Path(folder).absolute()
-    saved = _parse(folder / PROJECT_FILE)
-    trunks = _read_trunks(folder / saved.trunks_file, saved)
+    saved, trunks = _read_whole(folder)
     strangers = sorted(set(saved.trees) - set(trunks.ids))
     if strangers:
         raise _damaged(folder / PROJECT_FILE, f"it describes trees {strangers} that have no trunk")
+    source_path, other_source_path = _locate(folder, saved.source)
     return PlotState(
         plot_id=saved.plot_id,
-        source_path=_locate(folder, saved.source),
+        source_path=source_path,
+        other_source_path=other_source_path,
         source_used=tuple(Path(path) for path in saved.source.used),
         n_points=saved.source.n_points,
         fingerprint=saved.source.fingerprint,
@@ -145,6 +171,19 @@ def read_project(folder: Path | str) -> PlotState:
         trunks=trunks,
         trees={i: TreeRecord(**tree.model_dump()) for i, tree in saved.trees.items()},
     )
+
+
+def _read_whole(folder: Path) -> tuple[SavedProject, TrunkSet]:
+    """project.json and the trunks it names, which a writer removes as soon as it has saved others."""
+    saved = _parse(folder / PROJECT_FILE)
+    for _ in range(_N_LOOKS):
+        try:
+            return saved, _read_trunks(folder / saved.trunks_file, saved)
+        except FileNotFoundError:
+            missing, saved = saved.trunks_file, _parse(folder / PROJECT_FILE)
+            if saved.trunks_file == missing:
+                break
+    raise _damaged(folder / missing, "it is missing")
 
 
 def _parse(path: Path) -> SavedProject:
@@ -178,27 +217,56 @@ def _damaged(path: Path, problem: str) -> ProjectError:
     )
 
 
-def _locate(folder: Path, source: SavedSource) -> Path:
-    """The source beside the plot if it is there, else where it was."""
-    if source.relative_path is not None:
-        beside = Path(os.path.normpath(folder / source.relative_path))
-        if beside.exists():
-            return beside
-    return Path(source.path)
+def _locate(folder: Path, source: SavedSource) -> tuple[Path, Path | None]:
+    """The source beside the plot if there is such a file, else where it was; and the other, if both are there."""
+    before = Path(source.path)
+    if source.relative_path is None:
+        return before, None
+    beside = Path(os.path.normpath(folder / source.relative_path))
+    # os.path, not pathlib: that one raises where a folder may not be entered.
+    if not os.path.exists(beside):  # noqa: PTH110
+        return before, None
+    return beside, before if before != beside and os.path.exists(before) else None  # noqa: PTH110
 
 
 def _read_trunks(path: Path, saved: SavedProject) -> TrunkSet:
+    """Raises FileNotFoundError where there is no such file, and ProjectError whatever else is wrong with it."""
+    n_points = saved.source.n_points
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            ids, ends, points, origins = (archive[name] for name in ("ids", "ends", "points", "origins"))
-        _check_trunk_arrays(ids, ends, points, origins, saved.source.n_points)
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            if sorted(archive.namelist()) != sorted(f"{name}.npy" for name in _TRUNK_ARRAYS):
+                raise ValueError("it holds other things than trunks")
+            ids, ends, points, origins = (_read_array(archive, f"{name}.npy", n_points) for name in _TRUNK_ARRAYS)
+        _check_trunk_arrays(ids, ends, points, origins, n_points)
         parts = np.split(points, ends)[:-1]
         trunks = tuple(Trunk(int(i), part, str(origin)) for i, part, origin in zip(ids, parts, origins, strict=True))
         return TrunkSet(trunks, saved.next_id)
-    except FileNotFoundError:
-        raise _damaged(path, "it is missing") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (FileNotFoundError, MemoryError):
+        raise
+    except Exception as error:
+        # Archives and array headers can be damaged in more ways than their readers have names for.
         raise _damaged(path, str(error)) from error
+
+
+def _read_array(archive: zipfile.ZipFile, name: str, n_most: int) -> NDArray[Any]:
+    """One array as `_write_trunks` writes it: not packed, of one dimension.
+
+    `np.load` would make room for as many numbers as the header asks for; here that is `n_most`, and no more than
+    there are bytes in the file.
+    """
+    info = archive.getinfo(name)
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{name} is packed")
+    with archive.open(info) as member:
+        if np.lib.format.read_magic(member) != (1, 0):
+            raise ValueError(f"{name} is of another version")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        if len(shape) != 1 or not 0 <= shape[0] <= n_most:
+            raise ValueError(f"{name} has the shape {shape}")
+        content = member.read()
+    if dtype.hasobject or len(content) != shape[0] * dtype.itemsize:
+        raise ValueError(f"{name} is not what its header says")
+    return np.ndarray(shape, dtype, content)
 
 
 def _check_trunk_arrays(ids: Any, ends: Any, points: Any, origins: Any, n_points: int) -> None:
@@ -285,10 +353,28 @@ class ProjectWriter:
         if not text:
             return
         try:
-            with (self.folder / HISTORY_FILE).open("a+b") as file:
+            descriptor = open_own_file(self.folder / HISTORY_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND)
+            with open(descriptor, "a+b") as file:
                 _append_whole(file, text.encode("utf-8", errors="replace"))
         except OSError as error:
             raise ProjectError(f"The history of the plot could not be written ({error.strerror or error}).") from error
+
+    def put_history_aside(self) -> None:
+        """Begin a new history, where another plot is to be saved in place of the one that is there.
+
+        Raises:
+            ProjectError: It cannot be renamed.
+        """
+        history = self.folder / HISTORY_FILE
+        aside = (history.with_stem(f"{history.stem}-{number}") for number in itertools.count(1))
+        try:
+            history.rename(next(path for path in aside if not os.path.lexists(path)))
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            raise ProjectError(
+                f"The history of the plot could not be put aside ({error.strerror or error})."
+            ) from error
 
     def close(self) -> None:
         """Give the plot free for others. The lock file stays: removing it would race with the next writer."""
