@@ -6,9 +6,9 @@ value.
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, ClassVar, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from dbh_studio.errors import SettingError
 
@@ -21,9 +21,25 @@ def setting(default: Any, title: str, *, unit: str = "", help: str = "", **bound
 
 
 class SettingsModel(BaseModel):
-    """Frozen, and strict about names: a misspelt setting is an error, not silence."""
+    """Frozen, and strict about names: a misspelt setting is an error, not silence.
+
+    Attributes:
+        ascending: Pairs of fields of which the first must be the smaller.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    ascending: ClassVar[tuple[tuple[str, str], ...]] = ()
+
+    @model_validator(mode="after")
+    def _check_ascending(self) -> SettingsModel:
+        fields = type(self).model_fields
+        for low, high in self.ascending:
+            if not getattr(self, low) < getattr(self, high):
+                raise ValueError(
+                    f"{fields[low].title} ({low}) is {getattr(self, low)} but must be less than "
+                    f"{fields[high].title} ({high}), which is {getattr(self, high)}"
+                )
+        return self
 
     def changed(self, **values: Any) -> Any:
         """A copy with some fields changed and checked.
@@ -40,6 +56,8 @@ class SettingsModel(BaseModel):
 def setting_error(model: type[BaseModel], error: ValidationError) -> SettingError:
     """The first problem of a pydantic error, in plain words."""
     first = error.errors()[0]
+    if first["type"] == "value_error":  # of our own checks, which name the settings themselves
+        return SettingError(f"{first['ctx']['error']}.")
     path = [str(part) for part in first["loc"]]
     owner: Any = model
     for part in path[:-1]:
@@ -68,6 +86,8 @@ class GroundSettings(SettingsModel):
 
 class TrunkSettings(SettingsModel):
     """How trunks are found: a geometric detector or given labels, then the paper's chain."""
+
+    ascending = (("slab_low_m", "slab_high_m"), ("min_diameter_cm", "max_diameter_cm"))
 
     normal_max_deg: float = setting(
         45.0,
@@ -136,6 +156,8 @@ class TrunkSettings(SettingsModel):
 class MeasureSettings(SettingsModel):
     """How a diameter is measured."""
 
+    ascending = (("min_diameter_cm", "max_diameter_cm"),)
+
     curve: CurveName = setting("fourier", "Curve", help="the paper's three; it found Fourier the most robust")
     breast_height_m: float = setting(
         1.30,
@@ -200,6 +222,53 @@ class MeasureSettings(SettingsModel):
         90.0, "Smallest arc seen", unit="°", ge=0.0, le=360.0, help="with less of the ring seen no diameter is given"
     )
     seed: int = setting(0, "Random seed", ge=0, le=2**31 - 1)
+
+
+class MarkerSettings(SettingsModel):
+    """How printed markers are found in photos, and what is believed of their size."""
+
+    dictionaries: tuple[str, ...] = setting(
+        (), "Marker dictionaries", help="such as DICT_4X4_50; none named: they are guessed from the photos"
+    )
+    ids: tuple[int, ...] = setting((), "Marker ids", help="only these; none named: all of the dictionary")
+    side_m: float = setting(
+        1.0,
+        "Marker side",
+        unit="m",
+        gt=0.0,
+        le=10.0,
+        help="outer edge of the black square, for markers without their own",
+    )
+    side_error_mm: float = setting(
+        0.5, "Error of the side", unit="mm", ge=0.0, le=50.0, help="how well the side was measured with a ruler"
+    )
+    detection_width_px: int = setting(
+        3072,
+        "Search width",
+        unit="px",
+        ge=512,
+        le=16384,
+        help="photos are shrunk to this for the search, not for the fit",
+    )
+    min_match: float = setting(
+        0.8, "Smallest match", ge=0.3, le=0.99, help="correlation of a marker's inner cells with its pattern"
+    )
+    systematic_px: float = setting(
+        0.03,
+        "Shared corner error",
+        unit="px",
+        ge=0.0,
+        le=1.0,
+        help="what blur leaves in every edge and no number of photos averages out",
+    )
+    max_offset_px: float = setting(
+        3.0,
+        "Largest offset",
+        unit="px",
+        ge=0.2,
+        le=50.0,
+        help="a photo whose ray misses the marker by more is left out",
+    )
 
 
 class Settings(SettingsModel):

@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from dbh_studio.core.ground import PlaneGround, StemBaseGround, TerrainGround, fit_ground
 from dbh_studio.errors import CancelledError
@@ -184,3 +185,49 @@ def test_cancel_stops_the_work(method: str) -> None:
 
     with pytest.raises(CancelledError):
         fit_ground(plot(), settings=GroundSettings(method=method), progress=cancel)
+
+
+def test_a_wide_cloud_without_ground_has_bases_and_can_be_cancelled_while_they_settle() -> None:
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform(0, 60, (200_000, 2)), rng.uniform(5, 20, 200_000)])
+    xyz[:, 2] += 1.5 * np.sin(xyz[:, 0])
+    points = xyz.astype(np.float32)
+    points[::1000] = np.inf
+    seen: list[float] = []
+    ground = fit_ground(points, progress=lambda fraction, message="": seen.append(fraction))
+    assert isinstance(ground, StemBaseGround)
+    assert seen == sorted(seen)
+    assert seen[-1] > 0.9
+    # Bases are at least half a metre apart, each on one of the lowest points about it.
+    bases = ground.bases_m
+    assert len(bases) > 500
+    assert cKDTree(bases[:, :2]).query(bases[:, :2], k=2)[0][:, 1].min() >= 0.5
+    near = cKDTree(xyz[np.isfinite(points).all(axis=1), :2]).query_ball_point(bases[:, :2], 0.4)
+    z = xyz[np.isfinite(points).all(axis=1), 2]
+    lower = [int(np.count_nonzero(z[rows] < base[2] - 0.01)) for rows, base in zip(near, bases, strict=True)]
+    assert np.mean(np.asarray(lower) <= 3) > 0.9
+
+    def cancel(fraction: float, message: str = "") -> None:
+        if fraction > 0.9:
+            raise CancelledError
+
+    with pytest.raises(CancelledError):
+        fit_ground(points, progress=cancel)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_too_few_points_for_a_plane_give_a_flat_one_and_say_so(n: int) -> None:
+    points = np.array([[1.0, 2.0, 3.5], [4.0, 2.0, 3.0]], np.float32)[:n]
+    ground = fit_ground(points, settings=GroundSettings(method="plane"))
+    assert isinstance(ground, PlaneGround)
+    assert ground.z_at(FEET).tolist() == [float(points[:, 2].min())] * len(FEET)
+    assert "plane" in ground.notes[0]
+    with pytest.raises(ValueError, match="finite"):
+        fit_ground(np.full((n, 3), np.nan, np.float32), settings=GroundSettings(method="plane"))
+
+
+def test_points_in_a_row_carry_no_plane_and_that_is_said() -> None:
+    points = np.column_stack([np.zeros(40), np.zeros(40), np.linspace(0, 5, 40)]).astype(np.float32)
+    ground = fit_ground(points, settings=GroundSettings(method="plane", plane_tolerance_m=0.01))
+    assert np.isfinite(ground.z_at(FEET)).all()
+    assert ground.notes

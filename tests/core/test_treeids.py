@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbh_studio.core.cloud import PointCloud
-from dbh_studio.core.treeids import assigned, find_tree_id_attribute, is_tree_id_name, point_sets_from_ids
+from dbh_studio.core.treeids import (
+    assigned,
+    doubtful_tree_id_attribute,
+    find_tree_id_attribute,
+    is_tree_id_name,
+    point_sets_from_ids,
+)
 
 
 def _cloud(**attributes):
@@ -35,7 +41,7 @@ def test_the_specific_name_wins():
 
 
 def test_what_holds_no_tree_or_no_whole_numbers_is_passed_over():
-    assert find_tree_id_attribute(_cloud(treeID=[0, 0], label=[0, 1])) == "label"
+    assert find_tree_id_attribute(_cloud(treeID=[0, 0], instance=[0, 1])) == "instance"
     assert find_tree_id_attribute(_cloud(treeID=[0.5, 1.5])) is None
     assert find_tree_id_attribute(_cloud(treeID=[np.nan, 2.0])) == "treeID"
     assert find_tree_id_attribute(_cloud(intensity=[1, 2])) is None
@@ -65,3 +71,60 @@ def test_point_sets_need_one_column():
         point_sets_from_ids(np.zeros((3, 2)))
     with pytest.raises(ValueError, match="type"):
         point_sets_from_ids(np.array(["a"]))
+
+
+def _plot(n_trees=9, seed=0):
+    """(N, 3) points of upright trees 3 apart on a square of ground, and the tree of each (0: ground)."""
+    rng = np.random.default_rng(seed)
+    side = 3 * int(np.ceil(np.sqrt(n_trees)))
+    places = np.array([(3 * (i % (side // 3)) + 1.5, 3 * (i // (side // 3)) + 1.5) for i in range(n_trees)])
+    trees = [np.column_stack([rng.normal(xy, 0.4, (300, 2)), rng.uniform(0, 8, 300)]) for xy in places]
+    ground = np.column_stack([rng.uniform(0, side, (2000, 2)), rng.normal(0, 0.02, 2000)])
+    ids = np.repeat(np.arange(n_trees + 1), [2000, *[300] * n_trees])
+    return np.concatenate([ground, *trees]).astype(np.float32), ids
+
+
+def _plot_cloud(xyz, **attributes):
+    return PointCloud(xyz.astype(np.float32), np.zeros(3), attributes=attributes)
+
+
+@pytest.mark.parametrize("name", ["label", "labels", "Cluster_ID", "scalar_cluster", "segment_id"])
+@pytest.mark.parametrize("turn", [[0, 1, 2], [0, 2, 1], [2, 0, 1]], ids=["z up", "y up", "x up"])
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 40.0])
+def test_a_general_name_is_taken_where_its_values_are_trees(name, turn, unit):
+    xyz, ids = _plot()
+    cloud = _plot_cloud(unit * xyz[:, turn], **{name: ids})
+    assert find_tree_id_attribute(cloud) == name
+    assert doubtful_tree_id_attribute(cloud) is None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [lambda xyz, ids: np.where(ids > 0, 3, 1), lambda xyz, ids: (ids > 0).astype(int),
+     lambda xyz, ids: np.where(ids > 0, 1 + (xyz[:, 2] > 4), 0), lambda xyz, ids: np.ones(len(ids), int)],
+    ids=["ground and stems", "stems", "stems and crowns", "all the same"],
+)  # fmt: skip
+def test_classes_are_no_trees(values):
+    xyz, ids = _plot()
+    cloud = _plot_cloud(xyz, label=values(xyz, ids))
+    assert find_tree_id_attribute(cloud) is None
+    assert doubtful_tree_id_attribute(cloud) == "label"
+
+
+def test_patches_of_surface_are_no_trees():
+    xyz, _ = _plot()
+    patches = 1 + (xyz / 0.6).astype(int) @ [1, 100, 10_000]
+    assert find_tree_id_attribute(_plot_cloud(xyz, segment_id=patches)) is None
+
+
+def test_a_name_that_says_tree_is_believed_whatever_its_values():
+    xyz, ids = _plot()
+    cloud = _plot_cloud(xyz, treeID=np.where(ids > 0, 3, 1), label=ids)
+    assert find_tree_id_attribute(cloud) == "treeID"
+    assert doubtful_tree_id_attribute(cloud) is None
+
+
+def test_points_that_are_not_finite_do_not_decide():
+    xyz, ids = _plot()
+    xyz[::50] = np.nan
+    assert find_tree_id_attribute(_plot_cloud(xyz, label=ids)) == "label"

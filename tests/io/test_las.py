@@ -171,3 +171,34 @@ def test_progress_rises_and_cancels(tmp_path, survey_points, monkeypatch):
 
     with pytest.raises(CancelledError):
         read_las(tmp_path / "plot.laz", progress=cancel)
+
+
+def _with_classes(path, points, classes, *, point_format=6):
+    version = "1.4" if point_format >= 6 else "1.2"
+    _las(path, points, version=version, point_format=point_format, classification=np.asarray(classes, np.uint8))
+
+
+@pytest.mark.parametrize("point_format", [6, 7, 1])
+def test_points_classified_as_noise_are_left_out(tmp_path, survey_points, point_format):
+    classes = np.full(500, 5)
+    classes[:20], classes[20:30], classes[30:40] = 7, 18, 2
+    _with_classes(tmp_path / "plot.laz", survey_points, classes, point_format=point_format)
+    loaded = read_las(tmp_path / "plot.laz")
+    # Class 18 is high noise in the point formats of LAS 1.4, and nothing in the older ones.
+    wanted = (classes != 7) & ((classes != 18) | (point_format < 6))
+    assert np.abs(_absolute(loaded.cloud) - survey_points[wanted]).max() < 0.0001
+    assert (loaded.cloud.attributes["classification"] == classes[wanted]).all()
+    n_noise = 500 - np.count_nonzero(wanted)
+    assert [note for note in loaded.notes if f"{n_noise} points" in note and "noise" in note]
+
+
+def test_a_class_with_the_number_of_noise_that_most_points_have_is_kept(tmp_path, survey_points):
+    _with_classes(tmp_path / "plot.laz", survey_points, np.where(np.arange(500) < 300, 7, 2))
+    loaded = read_las(tmp_path / "plot.laz")
+    assert len(loaded.cloud) == 500
+    assert any("300 points" in note and "kept" in note for note in loaded.notes)
+
+
+def test_a_cloud_without_noise_says_nothing_of_it(tmp_path, survey_points):
+    _with_classes(tmp_path / "plot.laz", survey_points, np.full(500, 2))
+    assert read_las(tmp_path / "plot.laz").notes == ()

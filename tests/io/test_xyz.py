@@ -138,3 +138,27 @@ def test_blocks_join(tmp_path, survey_points, monkeypatch):
     monkeypatch.setattr("dbh_studio.io.xyz._BLOCK_BYTES", 2000)
     (tmp_path / "plot.xyz").write_text(_lines(survey_points))
     assert np.abs(_absolute(read_xyz(tmp_path / "plot.xyz").cloud) - survey_points).max() < 0.0001
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "cp1252"])
+@pytest.mark.parametrize("comment", ["# Åbo plot…", "# a\x0bb", "# a\x0cb"])
+def test_a_comment_that_looks_like_two_lines_costs_no_point(tmp_path, survey_points, encoding, comment):
+    text = comment.encode(encoding, "replace") + b"\n" + _lines(survey_points).encode()
+    (tmp_path / "plot.xyz").write_bytes(text)
+    assert len(read_xyz(tmp_path / "plot.xyz").cloud) == 500
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_letters_beyond_ascii_shift_no_column(tmp_path, survey_points, encoding):
+    rows = "".join(f"{x} {y} {z} Åasp\xe9n {i}\n" for i, (x, y, z) in enumerate(survey_points.tolist()))
+    (tmp_path / "plot.xyz").write_bytes(f"x y z Återväxt treeID\n{rows}".encode(encoding))
+    cloud = read_xyz(tmp_path / "plot.xyz").cloud
+    assert len(cloud) == 500
+    assert (cloud.attributes["treeID"] == np.arange(500)).all()
+
+
+def test_carriage_returns_alone_are_named(tmp_path, survey_points):
+    (tmp_path / "plot.xyz").write_bytes(_lines(survey_points).replace("\n", "\r").encode())
+    with pytest.raises(MalformedFileError, match="carriage return") as caught:
+        read_xyz(tmp_path / "plot.xyz")
+    assert caught.value.remedy

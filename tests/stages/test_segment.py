@@ -10,7 +10,7 @@ import pytest
 from tests.stages.small_forest import STAND, Tree, forest, ground_z
 
 from dbh_studio.core.ground import StemBaseGround, fit_ground
-from dbh_studio.errors import CancelledError
+from dbh_studio.errors import CancelledError, SettingError
 from dbh_studio.settings import TrunkSettings
 from dbh_studio.stages.segment import SegmentationResult, segment_trunks
 from dbh_studio.stages.trunk_chain import keep_clusters
@@ -265,3 +265,25 @@ def test_the_rendered_plot_all_measured_trees_are_found() -> None:
         assert np.hypot(*(positions - tree["centre_bh"][:2]).T).min() < 0.10
         here = np.array([[tree["x"], tree["y"]]])
         assert abs(float(ground.z_at(here)[0]) - tree["ground_z_centre"]) < 0.06
+
+
+@pytest.mark.parametrize("with_masks", [False, True])
+def test_stray_points_kilometres_away_change_nothing(with_masks: bool) -> None:
+    points, labels = forest(STAND[:3])
+    ground = fit_ground(points)
+    rng = np.random.default_rng(0)
+    strays = np.column_stack([rng.uniform(-1, 1, (60, 2)) * 60_000, np.empty(60)])
+    strays[:, 2] = ground.z_at(strays[:, :2]) + rng.uniform(1.0, 3.0, 60)
+    both = np.concatenate([points, strays.astype(np.float32)])
+    masks = (np.concatenate([labels, np.ones(60, int)]) > 0) if with_masks else None
+    expected = segment_trunks(points, ground, candidates=None if masks is None else masks[: len(points)])
+    found = segment_trunks(both, ground, candidates=masks)
+    assert len(found.point_sets) == 3
+    assert all(np.array_equal(a, b) for a, b in zip(found.point_sets, expected.point_sets, strict=True))
+
+
+def test_a_scale_that_makes_a_country_of_the_plot_is_named() -> None:
+    points, _ = forest(STAND[:3])
+    with pytest.raises(SettingError, match="km wide") as caught:
+        segment_trunks(points * [1e4, 1e4, 1.0], fit_ground(points))
+    assert "scale" in caught.value.remedy

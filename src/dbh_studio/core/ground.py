@@ -24,6 +24,8 @@ NO_GROUND_NOTE = (
     "so breast height may be too high by what is missing at the foot."
 )
 
+NO_PLANE_NOTE = "No plane is supported by three points of the cloud, so heights above the ground mean nothing."
+
 
 class GroundModel(Protocol):
     """A surface z = f(x, y) in the world frame, metres.
@@ -204,7 +206,7 @@ def fit_ground(
             progress=progress,
             seed=seed,
         )
-        return PlaneGround(coefficients, n_inliers)
+        return PlaneGround(coefficients, n_inliers, () if n_inliers >= 3 else (NO_PLANE_NOTE,))
     found = fit_terrain(
         points, cell_m=settings.cell_m, max_slope_deg=settings.max_slope_deg, progress=subprogress(progress, 0.0, 1.0)
     )

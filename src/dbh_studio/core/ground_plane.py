@@ -37,14 +37,17 @@ def fit_plane_ransac(
         seed: Of the samples.
 
     Returns:
-        (3,) a, b, c and the number of points that support the plane.
+        (3,) a, b, c and the number of points that support the plane. One or two points make none: the plane is flat,
+        through the lower one, and the number says so.
 
     Raises:
-        ValueError: Fewer than three finite points.
+        ValueError: No finite point.
     """
     finite = points[np.isfinite(points).all(axis=1)] if not np.isfinite(points.sum(dtype=np.float64)) else points
+    if not len(finite):
+        raise ValueError("the cloud has no finite point to fit a plane to")
     if len(finite) < 3:
-        raise ValueError(f"a plane needs three finite points, got {len(finite)}")
+        return np.array([0.0, 0.0, float(finite[:, 2].min())]), len(finite)
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(finite), min(len(finite), _SAMPLE), replace=False)
     sample = finite[np.sort(chosen)].astype(np.float64)

@@ -16,10 +16,12 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from dbh_studio.core.arrays import Bool, Float, Float32, Float64
-from dbh_studio.core.progress import Progress, ignore_progress
+from dbh_studio.core.neighbours import N_WORKERS
+from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.surfaces import local_plane
 
 _CHUNK = 1 << 19
+_CELLS_AT_ONCE = 20_000
 # Height of the bins in which a column's points are counted. Ground noise (a few cm) stays within two of them.
 _BIN_M = 0.25
 # A bin is ground only with this share of the column's fullest bin: isolated noise below ground has far less.
@@ -31,6 +33,8 @@ _LEVELS = ((24.0, 2.0), (12.0, 1.0), (6.0, 0.5), (3.0, 0.3))
 _FINE_LEVELS = ((2.0, 0.2), (1.0, 0.15))
 # More than noise below the surface: it is the underside of crowns, and stems hang below it.
 _BELOW_SHARE = 0.03
+# A stem's base is settled on the points this near in plan; bases nearer to each other than this are one.
+_BASE_REACH_M, _BASE_GAP_M = 0.75, 0.5
 # Without ground, what is lower than this above the lower surface of the cloud may be a stem's foot, not a crown.
 _CROWN_BASE_M = 1.0
 _MAX_NODES = 250_000
@@ -114,7 +118,8 @@ def fit_terrain(points: Float, *, cell_m: float, max_slope_deg: float, progress:
     terrain = Terrain((surface + level).astype(np.float32), corner, grid.cell, slope, is_ground)
     if share < _GROUND_SHARE or _share_below(column, surface) > _BELOW_SHARE:
         surface = _pull_down(low, gentle, _LEVELS, np.full(grid.shape, _floor(low, gentle)))
-        return replace(terrain, bases_m=_settled(points, _stem_bases(points, low, surface, level, grid)))
+        bases = _stem_bases(points, low, surface, level, grid)
+        return replace(terrain, bases_m=_settled(points, bases, subprogress(progress, 0.9, 1.0)))
     return replace(terrain, notes=_notes(share))
 
 
@@ -298,7 +303,9 @@ def _refine(points: Float, grid: _Grid, surface: Float64, progress: Progress) ->
         step = np.floor((residual + _BAND_M) / _STEP_M).astype(np.int64)
         inside = (step >= 0) & (step < n_steps)
         np.add.at(counts.reshape(-1), cell[inside] * np.int64(n_steps) + step[inside], np.int32(1))
-    level, sheet = _lowest_sheet(counts)
+    # In parts, because it needs several times the memory of the counts.
+    parts = [_lowest_sheet(part) for part in np.array_split(counts, len(counts) // _CELLS_AT_ONCE + 1)]
+    level, sheet = (np.concatenate(part) for part in zip(*parts, strict=True))
     return (flat + level).reshape(grid.shape), sheet.reshape(grid.shape)
 
 
@@ -359,25 +366,41 @@ def _lowest_point(points: Float) -> Float64:
     return finite[[int(finite[:, 2].argmin())]].astype(np.float64)
 
 
-def _settled(points: Float, bases: Float64) -> Float64:
+def _settled(points: Float, bases: Float64, progress: Progress) -> Float64:
     """(K, 3) bases put on the lowest points about them: not the very lowest, which may be noise, but the third."""
-    lowest = bases[:, 2].min() - 2 * _BIN_M
-    part = points[(points[:, 2] > lowest) & (points[:, 2] < bases[:, 2].max() + 2 * _BIN_M)].astype(np.float64)
-    distance, nearest = cKDTree(bases[:, :2]).query(part[:, :2], distance_upper_bound=0.75)
-    near = np.isfinite(distance)
-    part, nearest = part[near], nearest[near]
-    near = np.abs(part[:, 2] - bases[nearest, 2]) < 2 * _BIN_M
-    part, nearest = part[near], nearest[near]
+    part, base = _around_bases(points, bases, progress)
     settled = bases.copy()
-    for k in np.unique(nearest):
-        own = part[nearest == k]
-        rank = min(2, len(own) - 1)
-        foot = np.partition(own[:, 2], rank)[rank]
-        settled[k] = [*own[own[:, 2] <= foot + 0.2, :2].mean(axis=0), foot]
+    if len(part):
+        order = np.lexsort((part[:, 2], base))
+        part, base = part[order], base[order]
+        first = np.flatnonzero(np.diff(base, prepend=-1))
+        count = np.diff(first, append=len(base))
+        foot = part[first + np.minimum(2, count - 1), 2]
+        weight = (part[:, 2] <= np.repeat(foot, count) + 0.2).astype(np.float64)
+        middle = np.add.reduceat(part[:, :2] * weight[:, None], first) / np.add.reduceat(weight, first)[:, None]
+        settled[base[first]] = np.column_stack([middle, foot])
     # Two cells of one foot settle on the same points: the lower one stays.
     settled = settled[np.argsort(settled[:, 2], kind="stable")]
-    crowded = np.tril(np.hypot(*(settled[:, None, :2] - settled[None, :, :2]).transpose(2, 0, 1)) < 0.5, -1)
-    return settled[~crowded.any(axis=1)]
+    crowded = cKDTree(settled[:, :2]).query_pairs(_BASE_GAP_M, output_type="ndarray")
+    return np.delete(settled, np.unique(crowded.max(axis=1, initial=-1)), axis=0)
+
+
+def _around_bases(points: Float, bases: Float64, progress: Progress) -> tuple[Float64, Any]:
+    """(M, 3) the points about the height of the base nearest to them in plan, and (M,) the index of that base."""
+    tree = cKDTree(bases[:, :2])
+    lowest, highest = bases[:, 2].min() - 2 * _BIN_M, bases[:, 2].max() + 2 * _BIN_M
+    parts, nearest = [], []
+    for start in range(0, len(points), _CHUNK):
+        progress(start / len(points), "Looking for the feet of the stems")
+        part = points[start : start + _CHUNK].astype(np.float64)
+        part = part[(part[:, 2] > lowest) & (part[:, 2] < highest) & np.isfinite(part[:, :2]).all(axis=1)]
+        base = tree.query(part[:, :2], distance_upper_bound=_BASE_REACH_M, workers=N_WORKERS)[1]
+        near = np.flatnonzero(base < len(bases))
+        near = near[np.abs(part[near, 2] - bases[base[near], 2]) < 2 * _BIN_M]
+        parts.append(part[near])
+        nearest.append(base[near])
+    progress(1.0, "Looking for the feet of the stems")
+    return np.concatenate(parts), np.concatenate(nearest)
 
 
 def _notes(share: float) -> tuple[str, ...]:

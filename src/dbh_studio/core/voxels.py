@@ -8,6 +8,9 @@ import numpy as np
 
 from dbh_studio.core.arrays import Float, Float32, Int32, Int64, as_points
 
+# Along each axis: three such numbers make one 64-bit key.
+MAX_CUBES = 1 << 21
+
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
@@ -68,7 +71,7 @@ def cube_keys(points: Float, edge_m: float) -> Int64:
         # One column at a time: reductions over the short axis of an (N, 3) array are several times slower.
         column = points[:, axis]
         lower, upper = column.min(), column.max()
-        if not np.isfinite(lower + upper) or (upper - lower) / edge_m >= 1 << 21:
+        if not np.isfinite(lower + upper) or (upper - lower) / edge_m >= MAX_CUBES:
             raise ValueError("points must be finite and within 2²¹ cubes of each other")
         key <<= 21
         key |= ((column - lower) * column.dtype.type(1.0 / edge_m)).astype(np.int32)

@@ -134,8 +134,7 @@ class CloudBuilder:
         attributes: Mapping[str, NDArray[Any]] | None = None,
     ) -> None:
         """Append (n, 3) absolute float coordinates with their (n, 3) colours and (n,) attributes."""
-        with np.errstate(invalid="ignore"):
-            good = (np.abs(points_src) <= _LARGEST).all(axis=1)
+        good = _usable(points_src)
         n_good = int(np.count_nonzero(good))
         self.n_dropped += len(points_src) - n_good
         if not n_good:
@@ -143,7 +142,7 @@ class CloudBuilder:
         every = n_good == len(points_src)
         points = points_src if every else points_src[good]
         if self._origin is None:
-            median = np.median(points, axis=0).astype(np.float64)
+            median = np.array([np.median(points[:, axis]) for axis in range(points.shape[1])], np.float64)
             self._origin = np.where(np.abs(median) < _FAR, 0.0, np.floor(median))
         self._xyz.extend(points if not self._origin.any() else points - self._origin)
         if self._rgb is not None and self._scale is not None and rgb is not None:
@@ -171,6 +170,17 @@ class CloudBuilder:
             rgb = None  # LAS point formats 2, 3, 5, 7, 8 and 10 always hold colour, used or not.
         values = {key: column.finish() for key, column in self._attributes.items()}
         return PointCloud(self._xyz.finish(), self._origin, rgb, values, crs, name), tuple(notes)
+
+
+def _usable(points_src: NDArray[Any]) -> NDArray[np.bool_]:
+    """(n,) which of (n, 3) points have three coordinates that are finite and no larger than any survey's."""
+    columns = [points_src[:, axis] for axis in range(points_src.shape[1])]
+    # Nearly always all of them; NaN fails every comparison.
+    if len(points_src) and all(column.min() >= -_LARGEST and column.max() <= _LARGEST for column in columns):
+        return np.ones(len(points_src), bool)
+    with np.errstate(invalid="ignore"):
+        good: NDArray[np.bool_] = (np.abs(points_src) <= _LARGEST).all(axis=1)
+    return good
 
 
 def record_chunks(

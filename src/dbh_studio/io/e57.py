@@ -54,7 +54,7 @@ def read_e57(path: Path, *, progress: Progress = ignore_progress, attributes: At
     try:
         with pye57.E57(str(path)) as file:
             return _read(file, path, progress, attributes)
-    except (StudioError, OSError):
+    except (StudioError, OSError, MemoryError):
         raise
     except Exception as error:  # The C++ reader raises types of its own for damaged content.
         raise _named(path, error) from error

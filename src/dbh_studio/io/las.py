@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,6 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from dbh_studio.core.arrays import Float64
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.core.reconstruction import Provenance
@@ -31,6 +33,11 @@ _STANDARD = {
     "point_source_id",
     "user_data",
 }
+# "Low point" in every LAS, "high noise" in the point formats of LAS 1.4, where older ones leave 18 open.
+_NOISE = (7,)
+_NOISE_SINCE_14 = (7, 18)
+# More "noise" than this is no noise: somebody's own classes happen to have its number.
+_MOST_NOISE = 0.25
 # What LAS calls the same thing in its older point formats or what nobody measures with.
 _DULL = {"X", "Y", "Z", "red", "green", "blue", "bit_fields", "raw_classification", "classification_flags"}
 
@@ -38,13 +45,16 @@ _DULL = {"X", "Y", "Z", "red", "green", "blue", "bit_fields", "raw_classificatio
 def read_las(path: Path, *, progress: Progress = ignore_progress, attributes: Attributes = "needed") -> LoadedCloud:
     """Read LAS or LAZ in chunks.
 
+    Points that are classified as noise are left out, with a note; unless they are more than a quarter, which says that
+    the numbers of the classes mean something else.
+
     Raises:
         FileError: `MalformedFileError`, `TruncatedFileError` or `EmptyFileError`.
     """
     _check_header(path)
     try:
         return _read(path, progress, attributes)
-    except (StudioError, OSError, KeyboardInterrupt, SystemExit):
+    except (StudioError, OSError, MemoryError, KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # The LAZ decoder's panics are no subclass of Exception.
         raise _named(path, error) from error
@@ -106,9 +116,21 @@ def _check_chunk_table(path: Path, size: int, offset: int) -> None:
         raise MalformedFileError(path, f"The file claims {n_chunks:,} compressed chunks.", _AGAIN)
 
 
-def _read(path: Path, progress: Progress, attributes: Attributes) -> LoadedCloud:
-    import laspy
+def _import_laspy() -> Any:
+    """laspy, without the web client that it would read COPC over the network with: that doubles its import time."""
+    needless = "requests" not in sys.modules
+    if needless:
+        sys.modules["requests"] = None  # type: ignore[assignment]  # importing it now fails, which laspy provides for
+    try:
+        import laspy
+    finally:
+        if needless:
+            del sys.modules["requests"]
+    return laspy
 
+
+def _read(path: Path, progress: Progress, attributes: Attributes, *, keep_noise: bool = False) -> LoadedCloud:
+    laspy = _import_laspy()
     selection = laspy.DecompressionSelection.all() if attributes == "all" else _needed_layers(laspy)
     with laspy.open(path, decompression_selection=selection) as reader:
         header = reader.header
@@ -126,21 +148,50 @@ def _read(path: Path, progress: Progress, attributes: Attributes) -> LoadedCloud
             colour_dtype=np.uint16 if coloured else None,
             attribute_dtypes=dtypes,
         )
-        scales, offsets = np.asarray(header.scales, np.float64), np.asarray(header.offsets, np.float64)
-        done = 0
+        noise = _NOISE_SINCE_14 if header.point_format.id >= 6 else _NOISE
+        done = n_noise = 0
         chunk = max(1, min(CHUNK_POINTS, _CHUNK_BYTES // header.point_format.size))
         for points in reader.chunk_iterator(chunk):
-            xyz = np.stack([points.X, points.Y, points.Z], axis=1) * scales + offsets
+            xyz = _coordinates(points, header)
             rgb = np.stack([points.red, points.green, points.blue], axis=1) if coloured else None
-            builder.add(xyz, rgb, {name: np.asarray(points[name]) for name in dtypes})
+            values = {name: np.asarray(points[name]) for name in dtypes}
+            is_good = ~np.isin(values["classification"], noise)
+            n_noise += len(is_good) - int(np.count_nonzero(is_good))
+            if not keep_noise and not is_good.all():
+                xyz, rgb = xyz[is_good], None if rgb is None else rgb[is_good]
+                values = {name: column[is_good] for name, column in values.items()}
+            builder.add(xyz, rgb, values)
             done += len(points)
             progress(min(1.0, done / max(count, 1)), f"Reading {path.name}")
         if done < count:
             raise truncated(path, done, count)
         software = " ".join(map(_text, (header.generating_software, header.system_identifier))).strip()
         kind = "laz" if header.are_points_compressed else "las"
+    if n_noise > _MOST_NOISE * count and not keep_noise:
+        return _read(path, progress, attributes, keep_noise=True)
     cloud, dropped = builder.finish(name=path.name, crs=crs)
-    return LoadedCloud(cloud, (*notes, *dropped), Provenance(kind, software, metres_per_unit, geographic))
+    return LoadedCloud(
+        cloud,
+        (*notes, *_noise_note(n_noise, keep_noise), *dropped),
+        Provenance(kind, software, metres_per_unit, geographic),
+    )
+
+
+def _coordinates(points: Any, header: Any) -> Float64:
+    """(n, 3) absolute coordinates of a chunk; each coordinate lies in one piece, which is quicker all the way."""
+    xyz = np.empty((3, len(points))).T
+    for axis, raw in enumerate((points.X, points.Y, points.Z)):
+        np.multiply(raw, float(header.scales[axis]), out=xyz[:, axis])
+        xyz[:, axis] += float(header.offsets[axis])
+    return xyz
+
+
+def _noise_note(n_noise: int, kept: bool) -> tuple[str, ...]:
+    if not n_noise:
+        return ()
+    if kept:
+        return (f"{n_noise:,} points have the class number of noise; that is too many for noise, so they were kept.",)
+    return (f"{n_noise:,} points that the file classifies as noise were left out.",)
 
 
 def _text(value: str | bytes | None) -> str:

@@ -86,7 +86,7 @@ def _through_trimesh(path: Path, kind: str) -> tuple[Float64, NDArray[Any], UInt
         return _joined(
             path, [part for part in parts if getattr(part, "vertices", None) is not None and len(part.vertices)]
         )
-    except (FileError, OSError):
+    except (FileError, OSError, MemoryError):
         raise
     except Exception as error:  # It raises whatever its parsers stumble over.
         text = re.sub(r"\s+", " ", str(error))[:160]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +16,13 @@ from dbh_studio.core.arrays import Float64
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.reconstruction import Provenance, Reconstruction, TriangleMesh
+from dbh_studio.core.treeids import doubtful_tree_id_attribute, ids_of_tiles
 from dbh_studio.errors import (
     EmptyFileError,
     FileError,
     FileMissingError,
     MalformedFileError,
+    MissingComponentError,
     UnsupportedFormatError,
 )
 from dbh_studio.io import e57, las, mesh, pcd, ply, xyz
@@ -150,15 +153,36 @@ def read_reconstruction(
         FileError: Names the file, what is wrong and what to do.
     """
     path = Path(path)
-    if not path.exists():
-        raise FileMissingError(path, "There is no such file or folder.", "Check the path.")
-    if path.is_dir():
-        return _read_folder(path, progress, attributes, merge)
-    source = _Source(path, sniff_format(path))
     try:
-        return _read_source(source, progress, attributes)
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise FileMissingError(path, "There is no such file or folder.", "Check the path.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise FileMissingError(path, f"It cannot be opened ({reason}).", "Check the path.") from None
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        # Looking into a pipe would wait for ever, and what was looked at would be gone.
+        raise UnsupportedFormatError(path, "This is neither a file nor a folder.", "Save the cloud to a file first.")
+    if stat.S_ISDIR(mode):
+        if not os.access(path, os.R_OK | os.X_OK):
+            raise FileMissingError(path, "The folder cannot be looked into (permission denied).", "Allow reading it.")
+        return _with_offer(_read_folder(path, progress, attributes, merge))
+    try:
+        return _with_offer(_read_source(_Source.of(path), progress, attributes))
     except (OSError, MemoryError) as error:
         raise _io_error(path, error) from error
+
+
+def _with_offer(reconstruction: Reconstruction) -> Reconstruction:
+    """With a note where there may be tree ids under a name that means many things."""
+    name = doubtful_tree_id_attribute(reconstruction.cloud)
+    if name is None:
+        return reconstruction
+    note = (
+        f"The values {name!r} do not look like trees (each in one place, from low to high), so they were not used. "
+        "If they are the numbers of the trees, rename them treeID."
+    )
+    return replace(reconstruction, notes=(*reconstruction.notes, note))
 
 
 def _io_error(path: Path, error: OSError | MemoryError) -> FileError:
@@ -171,15 +195,17 @@ def _io_error(path: Path, error: OSError | MemoryError) -> FileError:
 
 @dataclass(frozen=True)
 class _Source:
-    """A file whose format is known."""
+    """A file whose format is known, and whether it has faces."""
 
     path: Path
     kind: str
+    is_mesh: bool
 
-    @property
-    def is_mesh(self) -> bool:
-        """Whether it has faces."""
-        return self.kind in _MESH_KINDS or (self.kind == "ply" and ply.read_header(self.path).count("face") > 0)
+    @classmethod
+    def of(cls, path: Path) -> _Source:
+        """Look into a file. Raises FileError where it is nothing that can be read."""
+        kind = sniff_format(path)
+        return cls(path, kind, kind in _MESH_KINDS or (kind == "ply" and ply.read_header(path).count("face") > 0))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -241,12 +267,14 @@ def _read_folder(folder: Path, progress: Progress, attributes: Attributes, merge
 
 
 def _mesh_beside(source: _Source, cloud: PointCloud, progress: Progress) -> tuple[TriangleMesh | None, list[str]]:
-    """The mesh about the cloud's origin. A damaged mesh is only a picture less, so it does not stop the plot."""
+    """The mesh about the cloud's origin. Without it there is only a picture less, so it does not stop the plot."""
     try:
         surface = mesh.read_mesh(source.path, kind=source.kind, progress=progress)
         return surface.as_mesh(cloud.origin), [*source.notes, f"{source.path.name} is shown; the points are measured."]
     except FileError as error:
         return None, [f"The mesh was left out. {error}"]
+    except MissingComponentError as error:
+        return None, [f"The mesh was left out. {source.path.name}: {error}"]
 
 
 def _find_sources(folder: Path) -> tuple[list[_Source], list[str]]:
@@ -264,7 +292,7 @@ def _find_sources(folder: Path) -> tuple[list[_Source], list[str]]:
             ):
                 continue
             try:
-                source = _Source(path, sniff_format(path))
+                source = _Source.of(path)
                 if source.kind == "xyz":
                     xyz.sniff_layout(path)
                 sources.append(source)
@@ -298,8 +326,8 @@ def _read_clouds(clouds: list[_Source], progress: Progress, attributes: Attribut
         )
         part = parts[largest]
         return Reconstruction(part.cloud, None, (tiles[largest].path,), (*ignored, *part.notes), part.provenance)
-    merged = merge_clouds([part.cloud for part in parts])
-    notes = [*ignored, f"{len(tiles)} clouds were merged: {', '.join(tile.path.name for tile in tiles)}."]
+    merged, remarks = merge_clouds([part.cloud for part in parts])
+    notes = [*ignored, f"{len(tiles)} clouds were merged: {', '.join(tile.path.name for tile in tiles)}.", *remarks]
     notes += [
         f"{tile.path.name}: {note}"
         for tile, part in zip(tiles, parts, strict=True)
@@ -334,8 +362,11 @@ def _are_tiles(clouds: list[PointCloud]) -> bool:
     return True
 
 
-def merge_clouds(clouds: list[PointCloud]) -> PointCloud:
-    """All points about the first cloud's origin; colours and attributes only where every cloud has them."""
+def merge_clouds(clouds: list[PointCloud]) -> tuple[PointCloud, tuple[str, ...]]:
+    """All points about the first cloud's origin, and notes; colours and attributes only where every cloud has them.
+
+    Tree ids that the clouds use for different trees are made different, see `ids_of_tiles`.
+    """
     origin = clouds[0].origin
     total = sum(map(len, clouds))
     xyz_all = np.empty((total, 3), np.float32)
@@ -349,5 +380,7 @@ def merge_clouds(clouds: list[PointCloud]) -> PointCloud:
     if len(colours) == len(clouds):
         rgb = np.concatenate(colours)
     names = [name for name in clouds[0].attributes if all(name in cloud.attributes for cloud in clouds)]
-    values = {name: np.concatenate([cloud.attributes[name] for cloud in clouds]) for name in names}
-    return PointCloud(xyz_all, origin, rgb, values, clouds[0].crs, clouds[0].name)
+    columns = {name: ids_of_tiles(clouds, name) for name in names}
+    values = {name: np.concatenate(parts) for name, (parts, _) in columns.items()}
+    notes = tuple(note for _, note in columns.values() if note)
+    return PointCloud(xyz_all, origin, rgb, values, clouds[0].crs, clouds[0].name), notes

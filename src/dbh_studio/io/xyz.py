@@ -28,6 +28,8 @@ _AXES = (
     ("z", "zm", "elevation", "height", "zcoord", "zcoordinate", "coordz", "pointsz", "points2", "posz", "pz"),
 )
 _COLOURS = (("r", "red", "rf"), ("g", "green", "gf"), ("b", "blue", "bf"))
+# Stands for letters in text columns: read as Latin-1, the bytes of some count as white space, which shifts columns.
+_WITHOUT_LETTERS = bytes(range(128)) + b"?" * 128
 _MISSING = re.compile(rb"(?<![\w.])(?:NA|N/A|NULL|null|None)(?![\w.])")
 
 
@@ -111,7 +113,7 @@ def sniff_layout(path: Path) -> TextLayout:
 
     Raises:
         EmptyFileError: There is no line of numbers.
-        MalformedFileError: There are numbers, but no x, y and z.
+        MalformedFileError: There are numbers, but no x, y and z; or the text is not in lines that can be read.
     """
     with open(path, "rb") as file:
         data = file.read(_SAMPLE_BYTES)
@@ -120,8 +122,7 @@ def sniff_layout(path: Path) -> TextLayout:
         raise MalformedFileError(
             path, "The text is not plain (it looks like UTF-16).", "Save it as UTF-8 or plain text."
         )
-    lines = data.decode("latin-1").removeprefix("\xef\xbb\xbf").splitlines()
-    lines = lines if complete or len(lines) < 2 else lines[:-1]
+    lines = _sample_lines(data, complete, path)
     header: list[str] = []
     comment = ""
     for number, line in enumerate(lines):
@@ -139,6 +140,24 @@ def sniff_layout(path: Path) -> TextLayout:
         if len(words) >= 3 and not (is_comment and header and len(words) > 20):
             header = [word.strip().strip('"') for word in words]
     raise EmptyFileError(path, "There is no line with three numbers in it.", "Export the cloud as x y z lines.")
+
+
+def _sample_lines(data: bytes, complete: bool, path: Path) -> list[str]:
+    """The lines of the beginning of a file, as the reader counts them: only line feeds end one."""
+    if b"\r" in data and b"\n" not in data:
+        raise MalformedFileError(
+            path,
+            "The lines end with carriage returns alone, as on very old Macs.",
+            "Save it with the line ends of Unix or Windows.",
+        )
+    lines = data.removeprefix(b"\xef\xbb\xbf").split(b"\n")
+    if len(lines) > 1 and (not complete or not lines[-1]):
+        del lines[-1]  # cut in the middle, or what follows the last line feed
+    try:
+        text = b"\n".join(lines).decode()
+    except UnicodeDecodeError:
+        text = b"\n".join(lines).decode("cp1252", "replace")
+    return text.split("\n")
 
 
 def _separator(text: str) -> tuple[str | None, bool]:
@@ -264,10 +283,16 @@ def read_xyz(path: Path, *, progress: Progress = ignore_progress, attributes: At
 
 
 def _cleaner(layout: TextLayout) -> Callable[[list[bytes]], list[bytes]]:
-    """Turn decimal commas into points, where there are any."""
-    if not layout.decimal_comma:
-        return lambda lines: lines
-    return lambda lines: b"".join(lines).replace(b",", b".").splitlines(keepends=True)
+    """Turn decimal commas into points, where there are any, and replace what is not ASCII."""
+
+    def clean(lines: list[bytes]) -> list[bytes]:
+        if layout.decimal_comma:
+            lines = b"".join(lines).replace(b",", b".").splitlines(keepends=True)
+        if not all(map(bytes.isascii, lines)):
+            lines = [line.translate(_WITHOUT_LETTERS) for line in lines]
+        return lines
+
+    return clean
 
 
 def _describe(layout: TextLayout) -> tuple[str, ...]:

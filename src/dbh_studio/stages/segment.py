@@ -23,7 +23,8 @@ from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64, 
 from dbh_studio.core.ground import GroundModel
 from dbh_studio.core.neighbours import N_WORKERS, point_spacing
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
-from dbh_studio.core.voxels import thin
+from dbh_studio.core.voxels import MAX_CUBES, thin
+from dbh_studio.errors import SettingError
 from dbh_studio.settings import TrunkSettings
 from dbh_studio.stages.stem_detection import LAYER_M, Stem, detect_stems
 from dbh_studio.stages.trunk_chain import Chain, Cluster, Outcome
@@ -32,6 +33,10 @@ _CHUNK = 1 << 20
 # More thinned points than this in the search slab are thinned further, so that large plots stay within memory and time.
 _MAX_SLAB_POINTS = 600_000
 _PIXEL_M = 0.10
+# The plot is where 98 % of the points are, and as far around as this many times its size. What is beyond is stray, and
+# one stray point would stretch every grid over kilometres.
+_STRAY_TAIL, _STRAY_SIZES = 0.01, 5.0
+_STRAY_SAMPLE = 200_000
 
 NO_TRUNK_NOTE = (
     "No trunk was found. Check the scale and the up axis, the search heights, and that the cloud shows stems "
@@ -110,6 +115,7 @@ def segment_trunks(
 
     Raises:
         ValueError: Wrong shapes.
+        SettingError: The plot would be tens of kilometres wide: the scale is wrong.
         CancelledError: From `progress`.
     """
     points = as_points(points_world, name="points_world")
@@ -153,11 +159,29 @@ def levelled(points: Float, height: Float, rows: Int64) -> Float32:
 
 
 def _heights(points: Float, ground: GroundModel, progress: Progress) -> Float32:
+    """(N,) height above ground; NaN, which is at no height, for stray points far outside the plot."""
+    lower, upper = _plot_box(points)
     height = np.empty(len(points), np.float32)
     for start in range(0, len(points), _CHUNK):
         progress(start / len(points), "Heights above ground")
-        height[start : start + _CHUNK] = ground.height_above(points[start : start + _CHUNK])
+        part = points[start : start + _CHUNK]
+        height[start : start + _CHUNK] = ground.height_above(part)
+        for axis in range(2):
+            inside = (part[:, axis] >= lower[axis]) & (part[:, axis] <= upper[axis])
+            height[start : start + _CHUNK][~inside] = np.nan
     return height
+
+
+def _plot_box(points: Float) -> tuple[Float64, Float64]:
+    """(2,) lower and (2,) upper corner, in plan, of what belongs to the plot."""
+    sample = points[:: max(1, len(points) // _STRAY_SAMPLE), :2].astype(np.float64)
+    sample = sample[np.isfinite(sample).all(axis=1)]
+    if not len(sample):
+        return np.zeros(2), np.zeros(2)
+    lower, upper = np.quantile(sample, [_STRAY_TAIL, 1.0 - _STRAY_TAIL], axis=0)
+    # The larger side counts for both: a narrow strip is not searched for strays across.
+    margin = _STRAY_SIZES * float((upper - lower).max()) + 1.0
+    return lower - margin, upper + margin
 
 
 def _slab(points: Float, height: Float32, wanted: Bool | None, settings: TrunkSettings) -> tuple[Float32, float]:
@@ -165,7 +189,13 @@ def _slab(points: Float, height: Float32, wanted: Bool | None, settings: TrunkSe
     inside = (height >= settings.slab_low_m) & (height < settings.slab_high_m)
     rows = np.flatnonzero(inside if wanted is None else inside & wanted)
     edge = settings.thinning_m
-    slab = thin(levelled(points, height, rows), edge).points
+    part = levelled(points, height, rows)
+    width = float(np.ptp(part[:, :2], axis=0).max()) if len(part) else 0.0
+    if not width < MAX_CUBES * edge:
+        raise SettingError(
+            f"The plot would be {width / 1000.0:,.0f} km wide.", "Check the scale, and crop the cloud to the plot."
+        )
+    slab = thin(part, edge).points
     while len(slab) > _MAX_SLAB_POINTS:
         edge *= 1.3
         slab = thin(slab, edge).points
