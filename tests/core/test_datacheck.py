@@ -221,6 +221,33 @@ def test_extent_spacing_and_findings():
     assert len({finding.topic for finding in check.findings}) == len(check.findings)
 
 
+@pytest.mark.parametrize("axis", UP_AXES)
+def test_the_extent_is_that_of_the_levelled_cloud(axis):
+    points = np.random.default_rng(0).uniform([0, 0, 0], [30, 20, 10], (5000, 3)) @ rotation_to_z_up(axis)
+    cloud = _cloud(points)
+    size = np.ptp(cloud.xyz.astype(float) @ rotation_to_z_up(axis).T, axis=0)
+    assert check_cloud(cloud, up_axis=axis, provenance=PLY).extent_src == pytest.approx(size, rel=1e-6)
+
+
+def test_the_extent_of_a_tilted_cloud():
+    turn = _random_rotation(3)
+    check = check_cloud(_cloud(make_forest() @ turn.T), provenance=PLY)
+    size = np.ptp(make_forest() @ turn.T @ check.rotation_world_from_source.T, axis=0)
+    assert check.up_direction_src == pytest.approx(turn @ [0, 0, 1.0], abs=0.04)
+    assert check.extent_src == pytest.approx(size, rel=1e-5)
+
+
+def test_few_planar_places_still_tell_the_axis():
+    """A scan of little but leaves: a first look at a quarter of it finds too few normals to say anything."""
+    rng = np.random.default_rng(1)
+    ground = np.column_stack([rng.uniform(0, 4, (300, 2)), rng.normal(0, 0.002, 300)])
+    leaves = rng.uniform([0, 0, 1.0], [4, 4, 4.0], (49_700, 3))
+    for axis in UP_AXES:
+        up = estimate_up(np.vstack([ground, leaves]) @ rotation_to_z_up(axis), axes_only=True)
+        assert up.axis == axis
+        assert up.confidence > 0.4
+
+
 def test_spacing_of_a_grid():
     x, y = np.meshgrid(np.arange(700) * 0.01, np.arange(700) * 0.01)
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])

@@ -17,6 +17,8 @@ HIGHLIGHT_YELLOW = (255, 208, 0)
 _FIRST_CHUNK = 60_000
 _LARGEST_CHUNK = 500_000
 
+_N_SHADES = 1024
+
 # Dark soil to light crown; readable in print and by colour-blind eyes (lightness rises steadily).
 _HEIGHT_STOPS = np.array(
     [[52, 40, 88], [49, 94, 140], [38, 148, 138], [110, 195, 88], [253, 231, 76]],
@@ -58,10 +60,10 @@ def height_colours(heights_m: Float, *, top_m: float | None = None) -> UInt8:
     if len(heights_m) == 0:
         return np.zeros((0, 3), np.uint8)
     top = float(np.percentile(heights_m, 99)) if top_m is None else top_m
-    position = np.clip(heights_m / max(top, 1e-6), 0.0, 1.0).astype(np.float32) * (len(_HEIGHT_STOPS) - 1)
-    lower = np.minimum(position.astype(np.int64), len(_HEIGHT_STOPS) - 2)
-    weight = (position - lower)[:, None]
-    return (_HEIGHT_STOPS[lower] * (1 - weight) + _HEIGHT_STOPS[lower + 1] * weight).astype(np.uint8)
+    steps = np.linspace(0.0, len(_HEIGHT_STOPS) - 1, _N_SHADES)
+    table = np.stack([np.interp(steps, np.arange(len(_HEIGHT_STOPS)), stops) for stops in _HEIGHT_STOPS.T], axis=1)
+    shade = np.clip(heights_m * ((_N_SHADES - 1) / max(top, 1e-6)), 0.0, _N_SHADES - 1.0).astype(np.int16)
+    return table.astype(np.uint8).take(shade, axis=0)
 
 
 def tree_colour(tree_id: int) -> tuple[int, int, int]:
@@ -87,13 +89,14 @@ def rough_heights(points: Float32, *, cell: float) -> Float32:
     """
     if len(points) == 0:
         return np.zeros(0, np.float32)
-    low = points[:, :2].min(axis=0)
+    # One coordinate at a time: over three columns at once numpy takes thirty times as long.
+    x, y, z = points.T
     # A flat file with one stray point a kilometre away must not allocate a huge grid.
-    extent = np.ptp(points[:, :2], axis=0)
-    cell = max(cell, float(extent.max()) / 2000.0, 1e-9)
-    cells = ((points[:, :2] - low) / cell).astype(np.int32)
-    n_columns = int(cells[:, 1].max()) + 1
-    keys = cells[:, 0] * n_columns + cells[:, 1]
+    cell = max(cell, float(np.ptp(x)) / 2000.0, float(np.ptp(y)) / 2000.0, 1e-9)
+    column, row = ((values - values.min()) / cell for values in (y, x))
+    n_columns = int(column.max()) + 1
+    keys = row.astype(np.int32) * n_columns + column.astype(np.int32)
     lowest = np.full(int(keys.max()) + 1, np.inf, np.float32)
-    np.minimum.at(lowest, keys, points[:, 2])
-    return points[:, 2] - lowest[keys]
+    np.minimum.at(lowest, keys, z)
+    heights: Float32 = z - lowest.take(keys)
+    return heights

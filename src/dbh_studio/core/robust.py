@@ -174,8 +174,9 @@ def robust_circle(
     centres, radii = centres[possible], radii[possible]
     if not len(radii):
         return None
-    offset = scored[None] - centres[:, None]
-    error = np.hypot(offset[..., 0], offset[..., 1]) - radii[:, None]
+    # Not `hypot`, which guards against overflows that metres do not have and takes five times as long.
+    across, along = (scored[:, i] - centres[:, i, None] for i in (0, 1))
+    error = np.sqrt(across * across + along * along) - radii[:, None]
     width = np.minimum(0.25 * tolerance_m, 0.25 * radii)[:, None]
     on = np.maximum(0.0, 1.0 - (error / width) ** 2)
     score = (on - 0.5 * (error < -2.5 * width)).sum(axis=1)
@@ -224,7 +225,15 @@ def _refined(
 
 def tukey_sigma(error: Float64) -> float:
     """Robust standard deviation about zero: 1.4826 times the median absolute value."""
-    return 1.4826 * float(np.median(np.abs(error)))
+    return 1.4826 * _median(np.abs(error))
+
+
+def _median(values: Float64) -> float:
+    """`np.median` of (N,) finite values; for some hundred of them most of its time goes into other cases."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    return 0.5 * float(np.partition(values, [middle - 1, middle])[middle - 1 : middle + 1].sum())
 
 
 def tukey_weight(error: Float64, sigma: float) -> Float64:

@@ -64,11 +64,22 @@ def outline_metrics(outline: Float64) -> tuple[float, float, float]:
     """Perimeter, area and convex girth of an (M, 2) closed outline (last vertex joins the first)."""
     step = np.roll(outline, -1, axis=0) - outline
     perimeter = float(np.hypot(step[:, 0], step[:, 1]).sum())
+    return perimeter, abs(_signed_area(outline)), perimeter if _is_convex(step) else _hull_girth(outline, perimeter)
+
+
+def _is_convex(step: Float64) -> bool:
+    """Whether a closed walk of (M, 2) steps turns one way only, and once."""
+    following = np.roll(step, -1, axis=0)
+    turn = np.arctan2(step[:, 0] * following[:, 1] - step[:, 1] * following[:, 0], (step * following).sum(axis=1))
+    one_way = bool((turn >= 0.0).all() or (turn <= 0.0).all())
+    return one_way and abs(abs(float(turn.sum())) - 2 * np.pi) < 0.1
+
+
+def _hull_girth(outline: Float64, perimeter: float) -> float:
     try:
-        girth = float(ConvexHull(outline).area)
+        return float(ConvexHull(outline).area)
     except QhullError:
-        girth = perimeter
-    return perimeter, abs(_signed_area(outline)), girth
+        return perimeter
 
 
 def _signed_area(outline: Float64) -> float:
@@ -99,7 +110,7 @@ def contains(outline: Float64, point: Float64) -> bool:
 
 def distance_to_outline(uv: Float64, outline: Float64) -> Float64:
     """(N,) distance of (N, 2) points to the closed polyline, exact to the two segments at the nearest vertex."""
-    _, nearest = cKDTree(outline).query(uv)
+    _, nearest = cKDTree(outline, balanced_tree=False, compact_nodes=False).query(uv)
     following = np.roll(outline, -1, axis=0)
     starts = np.stack([nearest, (nearest - 1) % len(outline)])
     segment = following[starts] - outline[starts]

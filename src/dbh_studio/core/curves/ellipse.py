@@ -60,7 +60,8 @@ class Ellipse:
         value = params @ np.stack([x * x, x * y, y * y, x, y, one])
         slope_x = params @ np.stack([2 * x, y, zero, one, zero, zero])
         slope_y = params @ np.stack([zero, x, 2 * y, zero, one, zero])
-        distance = np.abs(value) / np.maximum(np.hypot(slope_x, slope_y), 1e-12)
+        slope = np.sqrt(slope_x * slope_x + slope_y * slope_y)
+        distance = np.abs(value) / np.maximum(slope, 1e-12)
         return np.where(np.isfinite(distance), distance, np.inf)
 
     def outline(self, params: Float64) -> Float64:
