@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from dbh_studio.app.pipeline import segment_plot
 from dbh_studio.app.session import Session
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.ground import GroundModel
+from dbh_studio.core.progress import Progress
 from dbh_studio.core.synthetic import PlotRecipe, SyntheticPlot, make_plot
 from dbh_studio.core.trunks import TrunkSet
 from dbh_studio.io.las import write_las
@@ -67,3 +70,10 @@ def write_unscaled_ply(folder: Path, *, metres_per_unit: float = 1.7) -> Path:
 def true_diameters_cm() -> np.ndarray:
     """Perimeter / π of the plot's stems in the middle of the measured band, ascending."""
     return np.sort([tree.diameter_cm("curve", height_m=1.37) for tree in plot().trees])
+
+
+def endless_search(points_world: Any, settings: Settings, existing_ids: Any = None, *, progress: Progress) -> None:
+    """In place of `segment_plot`, where a test needs the time to press Cancel."""
+    for step in range(4000):
+        progress(0.1 + step / 10_000, f"Looking behind tree {step}")
+        time.sleep(0.02)

@@ -42,18 +42,19 @@ def ids_in(content: str) -> list[int]:
 
 
 def test_the_card_shows_the_number_and_where_it_was_measured(estimate):
-    card = html.tree_card(7, estimate, curve_title="Fourier")
+    card = html.tree_card(7, estimate)
     assert "Tree 7" in card
     assert 'data-dbh="30.0"' in card
     assert "1.22–1.52 m" in card
 
 
 def test_a_refused_tree_shows_reason_and_remedy_and_no_number():
-    card = html.tree_card(7, Refusal("small_arc", "Only 40° were seen.", "Walk round it."), curve_title="Fourier")
+    card = html.tree_card(7, Refusal("small_arc", "only 40° were seen.", "Walk round it."))
     assert "Only 40° were seen." in card
     assert "Walk round it." in card
     assert "data-dbh" not in card
-    assert not re.search(r"\d+(\.\d+)?<small> cm", card)
+    assert "no diameter" in card
+    assert "cm DBH" not in card
 
 
 def test_an_unknown_diameter_is_a_dash_never_zero():
@@ -91,13 +92,61 @@ def test_the_selected_row_is_marked():
         html.message(ATTACK, level=ATTACK, remedy=ATTACK),
         html.findings([(ATTACK, ATTACK, ATTACK)]),
         html.facts([(ATTACK, ATTACK)]),
-        html.tree_card(1, Refusal("x", ATTACK, ATTACK), curve_title=ATTACK),
+        html.tree_card(1, Refusal("x", ATTACK, ATTACK)),
+        html.job_box(ATTACK),
     ],
-    ids=["table", "header", "message", "findings", "facts", "card"],
+    ids=["table", "header", "message", "findings", "facts", "card", "job"],
 )
 def test_text_from_outside_never_becomes_markup(content):
     assert "<img" not in content
     assert "&lt;img" in content
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        html.job_js(0.5, ATTACK),
+        html.view_bar_js([(ATTACK, ATTACK)], ATTACK, [(ATTACK, ATTACK, ATTACK)]),
+    ],
+    ids=["job", "view bar"],
+)
+def test_text_from_outside_never_ends_a_script(script):
+    """It stays inside a string literal, without a `<` that could end the script."""
+    assert "<" not in script.replace("i<n", "")
+    assert "onerror" not in re.sub(r'"(?:[^"\\]|\\.)*"', "", script)
+    assert "onerror" in script
+
+
+def test_the_hint_leads_to_the_step_where_the_next_thing_is_done():
+    status = PlotStatus(has_plot=True, is_scaled=True)
+    elsewhere = html.header("plot", status, "open", saved="", undo="", redo="")
+    assert 'data-do="next"' in elsewhere
+    assert "3 Trunks" in elsewhere
+    there = html.header("plot", status, "trunks", saved="", undo="", redo="")
+    assert 'data-do="next"' not in there
+
+
+def test_the_hint_gives_its_place_to_a_running_job():
+    status = PlotStatus(has_plot=True, is_scaled=True)
+    assert "Press Find trunks." not in html.header("plot", status, "trunks", saved="", undo="", redo="", is_busy=True)
+    assert "Cancel" in html.job_box("Finding trunks")
+
+
+@pytest.mark.parametrize(("fraction", "width"), [(-1.0, "0%"), (0.256, "26%"), (7.0, "100%")])
+def test_the_bar_of_a_job_stays_in_its_box(fraction, width):
+    assert f'"{width}"' in html.job_js(fraction, "")
+
+
+def test_curves_are_called_by_their_titles():
+    text = "curves disagree by 5 %: fourier 29.5 cm, ellipse 29.5 cm, bspline 31.1 cm"
+    assert html.plain(text) == "Curves disagree by 5 %: Fourier 29.5 cm, ellipse 29.5 cm, B-spline 31.1 cm"
+    assert html.plain("") == ""
+
+
+def test_the_view_bar_shows_which_colours_are_on():
+    script = html.view_bar_js([("a", "First"), ("b", "Second")], "b", [])
+    pressed = re.findall(r'data-mode=\\"(\w)\\" aria-pressed=\\"(\w+)\\"', script)
+    assert pressed == [("a", "false"), ("b", "true")]
 
 
 def test_the_section_shows_points_and_all_three_curves(estimate):
@@ -128,3 +177,14 @@ def test_a_refusal_never_shows_a_diameter_in_the_legend():
     result = measure_stem(cylinder(arc_deg=50), settings=MeasureSettings(min_coverage_deg=180))
     assert isinstance(result, Refusal)
     assert " cm</span>" not in section_svg(result, curve="fourier")
+    accepted = measure_stem(cylinder())
+    assert " cm</span>" in section_svg(accepted, curve="fourier")
+
+
+def test_every_curve_can_be_chosen_in_the_legend(estimate):
+    picture = section_svg(estimate, curve="ellipse")
+    assert re.findall(r'data-choose="(\w+)" aria-pressed="(\w+)"', picture) == [
+        ("fourier", "false"),
+        ("ellipse", "true"),
+        ("bspline", "false"),
+    ]

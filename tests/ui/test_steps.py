@@ -27,7 +27,7 @@ def test_there_is_always_a_sentence_that_says_what_to_do(status):
 def test_trees_still_being_measured_are_not_called_refused():
     status = PlotStatus(has_plot=True, is_scaled=True, n_trunks=5, n_measured=2, n_waiting=3)
     assert "could not be measured" not in status.hint()
-    assert "3 to go" in status.hint()
+    assert "3 not measured yet" in status.hint()
 
 
 def test_refused_trees_are_counted():

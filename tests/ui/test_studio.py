@@ -1,7 +1,9 @@
 """The studio as a person uses it, over the real websocket, without a browser."""
 
 import csv
+import dataclasses
 import io
+import json
 import time
 
 import numpy as np
@@ -9,7 +11,10 @@ import plots
 import pytest
 from fakeclient import FakeClient
 
+from dbh_studio.app import commands
 from dbh_studio.app.opening import open_plot
+from dbh_studio.core.reconstruction import TriangleMesh
+from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.ui.server import start_server
 from dbh_studio.ui.studio import Studio
 
@@ -38,6 +43,8 @@ def open_by_path(tab, path):
     tab.wait_text("Open a point cloud")
     tab.set("File or folder", str(path))
     tab.press("Open")
+    tab.wait_text("Press Find trunks", LONG)
+    tab.bridge_send("step", "trunks")
     tab.wait(lambda t: path.stem in t.text() and t.has("Find trunks"), LONG)
 
 
@@ -45,7 +52,7 @@ def find_trunks(tab, studio):
     tab.press("Find trunks")
     tab.wait_text("trunks found", LONG)
     assert studio.wait_idle(LONG)
-    tab.wait(lambda t: "being measured" not in t.text(), LONG)
+    tab.wait(lambda t: "not measured yet" not in t.text(), LONG)
 
 
 @pytest.fixture
@@ -125,8 +132,8 @@ def test_undo_and_redo_of_a_deleted_trunk(measured, studio):
 
 def test_a_double_click_on_find_trunks_runs_once(tab, studio, plot_path):
     open_by_path(tab, plot_path)
-    tab.press("Find trunks")
-    tab.press("Find trunks")
+    tab.press("Find trunks", force=True)
+    tab.press("Find trunks", force=True)
     tab.wait_text("trunks found", LONG)
     assert studio.wait_idle(LONG)
     assert studio.session.undo_label.startswith("Find")
@@ -138,13 +145,29 @@ def test_cancel_leaves_the_plot_as_it_was(tab, studio, plot_path):
     open_by_path(tab, plot_path)
     before = studio.session.document
     tab.press("Find trunks")
-    tab.wait(lambda t: "Finding trunks" in t.text() and t.has("Cancel"))
-    tab.press("Cancel")
+    tab.wait(lambda t: "Finding trunks" in t.text() and "Cancel" in t.text())
+    tab.wait(lambda t: not t.enabled("Find trunks"))
+    tab.bridge_send("cancel")
     tab.wait_notification("Cancelled", LONG)
-    tab.wait(lambda t: not t.has("Cancel"))
+    tab.wait(lambda t: "Cancel" not in t.text() and t.enabled("Find trunks"))
     assert studio.session.document is before
     # And it can be started again.
     find_trunks(tab, studio)
+
+
+def test_cancelled_measuring_is_taken_up_again(tab, studio, plot_path):
+    open_by_path(tab, plot_path)
+    tab.press("Find trunks")
+    tab.wait_text("Measuring", LONG)
+    tab.bridge_send("cancel")
+    tab.wait_notification("Cancelled", LONG)
+    assert studio.wait_idle(LONG)
+    if not studio.session.unmeasured():  # the last tree was done before Cancel arrived
+        return
+    tab.wait_text("not measured yet")
+    tab.wait(lambda t: 'data-do="measure"' in t.html())
+    tab.bridge_send("measure")
+    tab.wait(lambda _: not studio.session.unmeasured(), LONG)
 
 
 def test_an_unscaled_cloud_is_not_measured_until_it_has_a_scale(tab, studio, tmp_path):
@@ -158,7 +181,7 @@ def test_an_unscaled_cloud_is_not_measured_until_it_has_a_scale(tab, studio, tmp
     tab.wait_notification("no scale")
     assert len(studio.session.document.trunks) == 0
     tab.bridge_send("step", "scale")
-    tab.set("One unit of the file is", "another unit")
+    tab.set("One unit is", "another unit")
     tab.set("Metres per unit", 1.7)
     tab.press("Set scale")
     tab.wait(lambda t: t.has("Find trunks"))
@@ -171,7 +194,7 @@ def test_changing_the_scale_afterwards_changes_the_diameters_and_keeps_the_trunk
     before = {row.stem_id: row.dbh_cm for row in studio.session.inventory()}
     trunks = studio.session.document.trunks
     measured.bridge_send("step", "scale")
-    measured.set("One unit of the file is", "another unit")
+    measured.set("One unit is", "another unit")
     measured.set("Metres per unit", 1.02)
     measured.press("Set scale")
     measured.wait(lambda t: studio.session.document.scale.metres_per_unit == 1.02)
@@ -185,13 +208,13 @@ def test_changing_the_scale_afterwards_changes_the_diameters_and_keeps_the_trunk
 def test_choosing_another_curve_measures_again(measured, studio):
     trunk_id = table_ids(measured)[0]
     measured.bridge_send("row", trunk_id)
-    measured.wait_text("Fourier, perimeter")
+    measured.wait_text("Fourier curve, perimeter")
     measured.set("Curve", "ellipse")
     measured.press("Measure again")
-    measured.wait_text("Ellipse, perimeter", LONG)
+    measured.wait_text("Ellipse curve, perimeter", LONG)
     assert studio.session.measurement(trunk_id).result.curve == "ellipse"
     measured.bridge_send("undo")
-    measured.wait_text("Fourier, perimeter", LONG)
+    measured.wait_text("Fourier curve, perimeter", LONG)
     measured.wait(lambda t: t.value("Curve") == "fourier")
 
 
@@ -207,7 +230,7 @@ def test_colour_modes_switch_by_visibility_only(measured):
     ):
         measured.settle()
         n_before = len(measured.messages)
-        measured.set("Colours", mode)
+        measured.bridge_send("colours", mode)
         measured.wait(lambda _, expected=expected: shown() == expected)
         measured.settle()
         sent = {message["type"] for message in measured.messages[n_before:]}
@@ -316,7 +339,7 @@ def test_a_path_that_does_not_exist(tab):
 def test_upload_through_the_browser(tab, studio, tmp_path, plot_path):
     tab.wait_text("Open a point cloud")
     tab.upload("Upload a cloud", "mine.laz", plot_path.read_bytes())
-    tab.wait(lambda t: "mine" in t.text() and t.has("Find trunks"), LONG)
+    tab.wait(lambda t: "mine" in t.text() and "Press Find trunks" in t.text(), LONG)
     assert (tmp_path / "uploads" / "mine.laz").exists()
     assert len(studio.session.cloud) == len(plots.plot().cloud)
 
@@ -374,3 +397,191 @@ def test_turning_a_y_up_cloud(tab, studio, plot_path):
     while not np.array_equal(studio.display.points, studio.session.points_world()[studio.display.indices]):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def test_a_click_on_a_curve_in_the_legend_measures_all_trees_by_it(measured, studio):
+    trunk_id = table_ids(measured)[0]
+    measured.bridge_send("row", trunk_id)
+    measured.wait_text("Fourier curve, perimeter")
+    before = studio.session.document
+    measured.bridge_send("curve", "ellipse")
+    measured.wait_text("Ellipse curve, perimeter", LONG)
+    assert studio.wait_idle(LONG)
+    assert {row.dbh_method for row in studio.session.inventory() if row.dbh_cm} == {"ellipse"}
+    assert studio.session.undo_label == "Measure by the Ellipse curve"
+    studio.session.undo()
+    assert studio.session.document is before
+
+
+@pytest.mark.parametrize("payload", ["circle", None, ["fourier"], {"curve": "ellipse"}, 3])
+def test_what_is_no_curve_changes_nothing(measured, studio, payload):
+    before = studio.session.document
+    measured.bridge_send("curve", payload)
+    measured.settle()
+    assert studio.session.document is before
+    assert not measured.notifications
+
+
+def test_breast_height_of_another_country_takes_effect_at_once(measured, studio):
+    trunk_id = table_ids(measured)[0]
+    measured.bridge_send("row", trunk_id)
+    measured.wait_text("1.22–1.52 m")
+    assert measured.value("Breast height") == "1.30 m (Europe, Canada)"
+    measured.set("Breast height", "1.37 m (USA)")
+    measured.wait_text("1.29–1.59 m", LONG)
+    assert studio.session.document.settings.measure.breast_height_m == 1.37
+    measured.bridge_send("undo")
+    measured.wait(lambda t: t.value("Breast height") == "1.30 m (Europe, Canada)", LONG)
+
+
+def test_an_own_breast_height_is_typed_and_then_shown_as_own(measured, studio):
+    before = studio.session.document
+    measured.set("Breast height", "own, set below")
+    measured.wait_notification("own breast height")
+    measured.wait(lambda t: t.value("Breast height") == "1.30 m (Europe, Canada)")
+    assert studio.session.document is before
+    measured.set("Breast height (m)", 1.0)
+    measured.press("Measure again")
+    measured.wait(lambda t: t.value("Breast height") == "own, set below", LONG)
+    assert studio.session.document.settings.measure.breast_height_m == 1.0
+
+
+def test_settings_in_sight_and_those_under_more_settings_are_both_used(tab, studio, plot_path):
+    open_by_path(tab, plot_path)
+    tab.set("Thinnest trunk (cm)", 7.0)
+    tab.set("Cluster neighbours", 12)
+    tab.set("Terrain cell (m)", 0.6)
+    find_trunks(tab, studio)
+    settings = studio.session.document.settings
+    assert (settings.trunks.min_diameter_cm, settings.trunks.cluster_min_points) == (7.0, 12)
+    assert settings.ground.cell_m == 0.6
+
+
+def test_scale_from_a_known_distance(tab, studio, tmp_path):
+    path = plots.write_unscaled_ply(tmp_path)
+    tab.wait_text("Open a point cloud")
+    tab.set("File or folder", str(path))
+    tab.press("Open")
+    tab.wait_text("This cloud has no scale yet", LONG)
+    tab.bridge_send("step", "scale")
+    tab.set("One unit is", "found from a known distance")
+    tab.wait(lambda t: t.has("True length (m)") and not t.has("Metres per unit"))
+    tab.set("True length (m)", 3.4)
+    tab.set("Length in file", 2.0)
+    tab.press("Set scale")
+    tab.wait(lambda _: studio.session.document.scale.metres_per_unit == pytest.approx(1.7))
+
+
+def test_the_unit_that_the_numbers_look_like_is_offered_and_not_taken(studio, tmp_path):
+    session = open_plot(plots.write_unscaled_ply(tmp_path), project_dir=tmp_path / "x.dbh")
+    session.data_check = dataclasses.replace(session.data_check, suggested_metres_per_unit=0.3048)
+    studio.adopt(session)
+    with FakeClient(studio.server.url) as tab:
+        tab.wait(lambda t: t.has("Set scale"), LONG)
+        tab.wait(lambda t: t.value("One unit is") == "feet")
+        assert not session.document.scale.is_known
+
+
+def test_a_doubt_about_the_file_is_read_before_anything_is_pressed(tab, studio, plot_path):
+    """The test plot is sparse, which the data check warns of."""
+    tab.wait_text("Open a point cloud")
+    tab.set("File or folder", str(plot_path))
+    tab.press("Open")
+    tab.wait_text("Data check: look at the lines marked !", LONG)
+    tab.wait(lambda t: 'data-do="next"' in t.html())
+
+
+def test_the_empty_picture_says_what_to_do_until_a_plot_is_open(tab, studio, plot_path):
+    tab.wait(lambda t: {"/floor", "/word"} <= set(t.scene))
+    open_by_path(tab, plot_path)
+    tab.wait(lambda t: not {"/floor", "/word"} & set(t.scene))
+
+
+def test_a_plot_with_trunks_is_opened_with_its_trunks_in_red(measured):
+    measured.wait(lambda t: t.scene["/red"].visible)
+    bar = next(script for script in reversed(measured.javascript) if "dbh-view" in script)
+    assert 'data-mode=\\"Segmentation (red)\\" aria-pressed=\\"true\\"' in bar
+
+
+def test_the_arrows_on_the_card_go_from_tree_to_tree(measured):
+    ids = table_ids(measured)
+    measured.bridge_send("row", ids[0])
+    measured.wait_text(f"Tree {ids[0]}")
+    measured.bridge_send("neighbour", 1)
+    measured.wait_text(f"Tree {ids[1]}")
+    measured.bridge_send("neighbour", -1)
+    measured.wait_text(f"Tree {ids[0]}")
+
+
+def test_no_mesh_no_checkbox(measured):
+    assert not measured.has("Mesh")
+
+
+def test_a_mesh_is_shown_where_the_cloud_is_and_only_when_asked_for(studio, tmp_path):
+    session = plots.measured_session(tmp_path)
+    session.do(commands.set_scale(ScaleEstimate(2.0, "factor")))
+    triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.5]], np.float32)
+    colours = np.array([[255, 0, 0], [0, 255, 0], [128, 128, 255]], np.uint8)
+    session.mesh = TriangleMesh(triangle, np.array([[0, 1, 2]], np.int32), colours)
+    studio.adopt(session)
+    with FakeClient(studio.server.url) as tab:
+        tab.wait(lambda t: t.has("Mesh"), LONG)
+        tab.settle()
+        assert "/mesh" not in tab.scene
+        tab.set("Mesh", True)
+        tab.wait(lambda t: "/mesh" in t.scene)
+        corners, shown, extensions = mesh_of(tab)
+        np.testing.assert_allclose(corners, 2.0 * triangle, atol=1e-6)
+        # Linear light: half of the brightness seen is a fifth of the light.
+        linear = [[255, 0, 0], [0, 255, 0], [56, 56, 255]]
+        np.testing.assert_allclose(shown.astype(int), linear, atol=1)
+        assert "KHR_materials_unlit" in extensions  # the daylight is in the colours already
+        assert not tab.scene["/rgb"].visible  # points in the same place would show through
+        tab.set("Mesh", False)
+        tab.wait(lambda t: not t.scene["/mesh"].visible and t.scene["/rgb"].visible)
+        tab.set("Mesh", True)
+        tab.wait(lambda t: t.scene["/mesh"].visible)
+        # It follows the cloud when the scale is corrected.
+        session.do(commands.set_scale(ScaleEstimate(3.0, "factor")))
+        tab.wait(lambda t: "/mesh" in t.scene and mesh_of(t)[0].max() > 2.5, LONG)
+        np.testing.assert_allclose(mesh_of(tab)[0], 3.0 * triangle, atol=1e-6)
+
+
+def mesh_of(tab):
+    """Corners and colours of the surface as the page gets it: a GLB of one part."""
+    content = bytes(tab.scene["/mesh"].props["glb_data"])
+    size = int.from_bytes(content[12:16], "little")
+    tree, buffer = json.loads(content[20 : 20 + size]), content[28 + size :]
+    (primitive,) = tree["meshes"][0]["primitives"]
+
+    def values(name, dtype):
+        accessor = tree["accessors"][primitive["attributes"][name]]
+        start = tree["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        width = int(accessor["type"].removeprefix("VEC"))
+        return np.frombuffer(buffer, dtype, accessor["count"] * width, start).reshape(-1, width)
+
+    return values("POSITION", np.float32), values("COLOR_0", np.uint8)[:, :3], tree["materials"][0]["extensions"]
+
+
+def test_a_mesh_too_large_for_a_browser_is_not_sent(studio, tmp_path, monkeypatch):
+    monkeypatch.setattr("dbh_studio.ui.view_controls.MOST_FACES", 0)
+    session = plots.measured_session(tmp_path)
+    session.mesh = TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
+    studio.adopt(session)
+    with FakeClient(studio.server.url) as tab:
+        tab.wait(lambda t: t.has("Mesh"), LONG)
+        tab.set("Mesh", True)
+        tab.wait_notification("too many for a browser")
+        tab.wait(lambda t: t.value("Mesh") is False)
+        assert "/mesh" not in tab.scene
+
+
+def test_a_mesh_without_colours_is_lit(studio, tmp_path):
+    session = plots.measured_session(tmp_path)
+    session.mesh = TriangleMesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
+    studio.adopt(session)
+    with FakeClient(studio.server.url) as tab:
+        tab.wait(lambda t: t.has("Mesh"), LONG)
+        tab.set("Mesh", True)
+        tab.wait(lambda t: "/mesh" in t.scene)
+        assert b"KHR_materials_unlit" not in bytes(tab.scene["/mesh"].props["glb_data"])

@@ -74,7 +74,7 @@ def acknowledged(tab: FakeClient) -> list[int]:
 def test_a_file_arrives_whole_with_progress(server: StudioServer, inbox: Inbox, tab: FakeClient) -> None:
     content = bytes(range(256)) * (2 * PART_BYTES // 256) + b"end"
     tab.upload("Upload", "oak plot.PLY", content)
-    tab.wait(lambda _: len(inbox.contents) > 0)
+    tab.wait(lambda t: len(inbox.contents) > 0 and len(acknowledged(t)) == 3)
     assert inbox.contents == [("oak plot.PLY", content)]
     assert acknowledged(tab) == [PART_BYTES, 2 * PART_BYTES, len(content)]
     assert inbox.progress[-1] == (len(content), len(content))

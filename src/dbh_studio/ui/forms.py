@@ -19,17 +19,21 @@ class SettingsForm(Generic[Model]):
     A value that is half typed is not a decision, so the plot changes only when a button reads the whole form.
     """
 
-    def __init__(self, gui: viser.GuiApi, values: Model, *, names: tuple[str, ...] | None = None) -> None:
+    def __init__(self, gui: viser.GuiApi, values: Model, *, first: tuple[str, ...] = ()) -> None:
         """Add the inputs at the GUI's current place.
 
         Args:
             gui: The tab's GUI.
             values: The model to show.
-            names: Fields to show, in this order; all where None.
+            first: The fields most people want, in this order; the others are in a closed folder. All where empty.
         """
         self._values = values
-        chosen = names if names is not None else tuple(type(values).model_fields)
-        self._handles = {name: _add_input(gui, values, name) for name in chosen}
+        every = tuple(type(values).model_fields)
+        self._handles = {name: _add_input(gui, values, name) for name in first or every}
+        others = [name for name in every if name not in self._handles]
+        if others:
+            with gui.add_folder("More settings", expand_by_default=False):
+                self._handles.update((name, _add_input(gui, values, name)) for name in others)
 
     def handle(self, name: str) -> Any:
         """The input of one field, for those that take effect at once."""
@@ -56,7 +60,7 @@ def _add_input(gui: viser.GuiApi, values: SettingsModel, name: str) -> Any:
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     unit = str(extra.get("unit", ""))
     label = f"{field.title} ({unit})" if unit else str(field.title)
-    value, hint = getattr(values, name), field.description or None
+    value, hint = getattr(values, name), _hint(type(values), name, unit)
     if typing.get_origin(field.annotation) is typing.Literal:
         return gui.add_dropdown(label, typing.get_args(field.annotation), initial_value=value, hint=hint)
     if isinstance(value, bool):
@@ -64,6 +68,13 @@ def _add_input(gui: viser.GuiApi, values: SettingsModel, name: str) -> Any:
     low, high = bounds(type(values), name)
     step: Any = 1 if isinstance(value, int) else 0.01 if value < 10 else 0.5
     return gui.add_number(label, value, min=low, max=high, step=step, hint=hint)
+
+
+def _hint(model: type[SettingsModel], name: str, unit: str) -> str | None:
+    """What the setting is, and from where to where it goes."""
+    low, high = bounds(model, name)
+    limits = "" if low is None or high is None else f"{low:g} to {high:g} {unit}".rstrip()
+    return "; ".join(text for text in (model.model_fields[name].description, limits) if text) or None
 
 
 def bounds(model: type[SettingsModel], name: str) -> tuple[Any, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 
@@ -16,8 +16,11 @@ TABLE_COLUMNS: tuple[tuple[str, str, str, bool], ...] = (
     ("dbh", "DBH cm", "Diameter at breast height", False),
     ("quality", "Quality", "From the arc seen, the residual and the agreement of the curves", True),
     ("arc", "Arc °", "How much of the ring was seen", False),
-    ("remark", "Remark", "Species, note, or why there is no diameter", True),
+    ("remark", "Remark", "Species, note, what to look at, or why there is no diameter", True),
 )
+# A script may arrive together with the HTML it is about, and the page draws that a moment later.
+_NOW_AND_ONCE_DRAWN = "f();setTimeout(f,80);"
+CURVE_TITLES: Mapping[str, str] = {"fourier": "Fourier", "ellipse": "Ellipse", "bspline": "B-spline"}
 
 
 def style_js() -> str:
@@ -29,7 +32,16 @@ def style_js() -> str:
     )
 
 
-def header(plot_name: str, status: PlotStatus, active: StepName, *, saved: str, undo: str, redo: str) -> str:
+def plain(text: str) -> str:
+    """A sentence as a person reads it: a capital first, and the curves by their titles."""
+    for name, title in CURVE_TITLES.items():
+        text = text.replace(name, title if name != "ellipse" else name)
+    return text[:1].upper() + text[1:]
+
+
+def header(
+    plot_name: str, status: PlotStatus, active: StepName, *, saved: str, undo: str, redo: str, is_busy: bool = False
+) -> str:
     """Plot name, where it is saved, Undo and Redo, the five steps, and the sentence that says what to do now.
 
     Args:
@@ -39,27 +51,64 @@ def header(plot_name: str, status: PlotStatus, active: StepName, *, saved: str, 
         saved: Where the plot is saved, or that it is not.
         undo: What Undo would undo; empty where nothing.
         redo: What Redo would do again; empty where nothing.
+        is_busy: A job runs: its box stands where the sentence would, so that nothing jumps.
     """
     done = status.done()
     buttons = "".join(
         f'<button type="button" data-step="{name}" data-state="{"done" if name in done else "open"}" '
         f'data-active="{"true" if name == active else "false"}" onclick="{call("step", name)}">'
-        f"{'&#10003; ' if name in done else f'{number} '}{title}</button>"
+        f"{'&#10003;' if name in done else number} {title}</button>"
         for number, (name, title) in enumerate(STEP_TITLES.items(), start=1)
     )
-    level = "ok" if done >= set(STEP_TITLES) else "todo"
     return (
-        f'<div class="dbh"><div class="dbh-top"><h3>{esc(plot_name or "No plot open")}</h3>'
+        f'<div class="dbh"><div class="dbh-top"><h3 title="{esc(plot_name)}">{esc(plot_name or "No plot open")}</h3>'
         f"{_history_button('undo', '&#8630; Undo', undo)}{_history_button('redo', '&#8631; Redo', redo)}</div>"
-        f'<div class="muted">{esc(saved)}</div>'
+        f'<div class="muted dbh-saved">{esc(saved)}</div>'
         f'<div class="dbh-steps">{buttons}</div>'
-        f'<div class="dbh-hint" data-level="{level}">{esc(status.hint())}</div></div>'
+        f"{'' if is_busy else _hint(status, active)}</div>"
     )
+
+
+def _hint(status: PlotStatus, active: StepName) -> str:
+    """What to do now, with a button where that is done in another step than the one on screen."""
+    following, all_done = status.next_step(), status.done() >= set(STEP_TITLES)
+    button = ""
+    if status.n_waiting:  # the measuring was cancelled
+        button = f'<button type="button" data-do="measure" onclick="{call("measure")}">Measure</button>'
+    elif following != active and not all_done:
+        number = list(STEP_TITLES).index(following) + 1
+        title = f"{number} {STEP_TITLES[following]} &#8594;"
+        button = f'<button type="button" data-do="next" onclick="{call("step", following)}">{title}</button>'
+    level = "ok" if all_done else "todo"
+    return f'<div class="dbh-hint dbh-row" data-level="{level}"><span>{esc(status.hint())}</span>{button}</div>'
 
 
 def _history_button(kind: str, title: str, label: str) -> str:
     state = "" if label else " disabled"
-    return f'<button type="button" data-do="{kind}" title="{esc(label)}" onclick="{call(kind)}"{state}>{title}</button>'
+    tip = f"{kind.capitalize()}: {label}" if label else ""
+    return f'<button type="button" data-do="{kind}" title="{esc(tip)}" onclick="{call(kind)}"{state}>{title}</button>'
+
+
+def job_box(title: str) -> str:
+    """What runs, how far it is (see `job_js`), and Cancel.
+
+    It is put on the page once for each job: a button that is replaced with every per cent cannot be pressed.
+    """
+    return (
+        f'<div class="dbh"><div class="dbh-hint dbh-row dbh-job" data-level="busy"><span>{esc(title)}'
+        f'<span class="dbh-job-text"></span><div class="dbh-bar"><div></div></div></span>'
+        f'<button type="button" data-do="cancel" onclick="{call("cancel")}">&#10005; Cancel</button></div></div>'
+    )
+
+
+def job_js(fraction: float, message: str) -> str:
+    """JavaScript that moves the bar of `job_box`."""
+    width, text = js(f"{100 * min(max(fraction, 0.0), 1.0):.0f}%"), js(f": {message}" if message else " …")
+    return (
+        "(()=>{const f=()=>{const b=document.querySelector('.dbh-job');if(!b)return;"
+        f"b.querySelector('.dbh-bar div').style.width={width};b.querySelector('.dbh-job-text').textContent={text};}};"
+        f"{_NOW_AND_ONCE_DRAWN}}})()"
+    )
 
 
 def message(text: str, *, level: str = "todo", remedy: str = "") -> str:
@@ -86,32 +135,52 @@ def facts(pairs: Sequence[tuple[str, str]]) -> str:
 DEFINITION_TITLES = {"curve": "perimeter / π", "tape": "tape: convex girth / π", "area": "equal-area circle"}
 
 
-def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, curve_title: str) -> str:
-    """What the forester reads after clicking a trunk."""
+def no_tree_card() -> str:
+    """In place of a card while no tree is chosen."""
+    return '<div class="dbh muted dbh-empty">No tree is chosen.</div>'
+
+
+def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "") -> str:
+    """What the forester reads after clicking a trunk.
+
+    Args:
+        tree_id: Its number.
+        result: The diameter, or why there is none.
+        section: The picture of the cross-section, see `section_svg`.
+    """
+    before, after = (
+        f'<button type="button" data-do="{tip}" title="{tip} tree ({key})" '
+        f'onclick="{call("neighbour", n)}">{arrow}</button>'
+        for tip, key, n, arrow in (("Previous", "P", -1, "&#9664;"), ("Next", "N", 1, "&#9654;"))
+    )
+    title = f'<h3>Tree {tree_id}</h3><span class="dbh-neighbours">{before}{after}</span>'
     if isinstance(result, Refusal):
         return (
-            f'<div class="dbh dbh-card" data-tree="{tree_id}"><h3>Tree {tree_id}</h3>'
-            f'<div class="dbh-number" style="font-size:24px">no diameter '
-            f'<span class="dbh-badge" data-quality="none">not measured</span></div>'
-            f'<div class="dbh-hint" data-level="stop">{esc(result.reason)}'
-            f"<br><b>What to do:</b> {esc(result.remedy)}</div></div>"
+            f'<div class="dbh dbh-card" data-tree="{tree_id}"><div class="dbh-number">{title}'
+            f'<b class="none">no diameter</b></div>'
+            f'<div class="dbh-hint" data-level="stop">{esc(plain(result.reason))}'
+            f"<br><b>What to do:</b> {esc(plain(result.remedy))}</div>{section}</div>"
         )
-    section = result.section
-    low, high = section.band_m
+    cut = result.section
+    low, high = cut.band_m
     pairs = [
-        ("Measured at", f"{low:.2f}–{high:.2f} m, middle {section.hom_m:.2f} m"),
-        ("Curve", f"{curve_title}, {DEFINITION_TITLES.get(result.definition, result.definition)}"),
-        ("Ring seen", f"{section.coverage_deg:.0f}°, largest gap {section.max_gap_deg:.0f}°"),
-        ("Residual", f"{result.rmse_mm:.1f} mm over {result.n_points:,} points"),
-        ("Lean", f"{section.lean_deg:.0f}°"),
+        ("Measured at", f"{low:.2f}–{high:.2f} m, middle {cut.hom_m:.2f} m"),
+        ("Read from", f"{CURVE_TITLES.get(result.curve, result.curve)} curve, {_definition(result)}"),
+        ("Ring seen", f"{cut.coverage_deg:.0f}°, largest gap {cut.max_gap_deg:.0f}°"),
+        ("Scatter", f"{result.rmse_mm:.1f} mm about the curve, {result.n_points:,} points"),
+        ("Lean", f"{cut.lean_deg:.0f}°"),
     ]
-    flags = "".join(f'<li data-level="warn">{esc(flag)}</li>' for flag in result.flags)
+    flags = "".join(f'<li data-level="warn">{esc(plain(flag))}</li>' for flag in result.flags)
     return (
-        f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><h3>Tree {tree_id}</h3>'
-        f'<div class="dbh-number">{result.dbh_cm:.1f}<small> cm DBH</small> '
+        f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><div class="dbh-number">'
+        f"{title}<b>{result.dbh_cm:.1f}</b><small>cm DBH</small>"
         f'<span class="dbh-badge" data-quality="{esc(result.quality)}">{esc(result.quality)}</span></div>'
-        f"{facts(pairs)}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}</div>"
+        f"{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(pairs)}</div>"
     )
+
+
+def _definition(result: DbhEstimate) -> str:
+    return DEFINITION_TITLES.get(result.definition, result.definition)
 
 
 @dataclass(frozen=True)
@@ -165,10 +234,11 @@ def tree_table(rows: Sequence[TableRow], *, selected: int | None, column: str, d
     )
     body = "".join(
         f'<tr data-id="{row.id}" data-selected="{"true" if row.id == selected else "false"}" '
-        f'onclick="{call("row", row.id)}">'
+        f'data-quality="{esc(row.quality or "none")}" onclick="{call("row", row.id)}">'
         + "".join(
-            f'<td class="{"text" if is_text else ""}">{esc(cell)}</td>'
-            for cell, (_, _, _, is_text) in zip(row.cells(), TABLE_COLUMNS, strict=True)
+            f'<td class="{"text" if is_text else ""}" data-column="{key}"'
+            f"{f' title={chr(34)}{esc(cell)}{chr(34)}' if key == 'remark' else ''}>{esc(cell)}</td>"
+            for cell, (key, _, _, is_text) in zip(row.cells(), TABLE_COLUMNS, strict=True)
         )
         + "</tr>"
         for row in sort_rows(rows, column, descending=descending)
@@ -182,10 +252,41 @@ def tree_table(rows: Sequence[TableRow], *, selected: int | None, column: str, d
 
 
 def select_row_js(tree_id: int | None) -> str:
-    """JavaScript that moves the table's highlight without replacing the table, so that its scroll position stays."""
+    """JavaScript that moves the table's highlight without replacing the table, so that its scroll position stays.
+
+    Only the table scrolls to the row: the panel around it stays where the person left it.
+    """
     wanted = js(None if tree_id is None else str(tree_id))
     return (
-        f"(()=>{{const id={wanted};document.querySelectorAll('.dbh-table tr[data-id]').forEach(r=>{{"
-        "const on=r.dataset.id===id;r.dataset.selected=on;"
-        "if(on)r.scrollIntoView({block:'nearest'});});})()"
+        f"(()=>{{const id={wanted},f=()=>{{document.querySelectorAll('.dbh-table tr[data-id]').forEach(r=>{{"
+        "const on=r.dataset.id===id;r.dataset.selected=on;if(!on)return;"
+        "const box=r.closest('.dbh-scroll'),head=box.querySelector('thead').offsetHeight;"
+        "if(r.offsetTop<box.scrollTop+head)box.scrollTop=r.offsetTop-head;"
+        "else if(r.offsetTop+r.offsetHeight>box.scrollTop+box.clientHeight)"
+        f"box.scrollTop=r.offsetTop+r.offsetHeight-box.clientHeight;}});}};{_NOW_AND_ONCE_DRAWN}}})()"
+    )
+
+
+def view_bar_js(modes: Sequence[tuple[str, str]], mode: str, looks: Sequence[tuple[str, str, str]]) -> str:
+    """JavaScript that puts the bar with colours and views into the corner of the picture, in place of an older one.
+
+    Args:
+        modes: (value, title) of each colour mode.
+        mode: The one that is on.
+        looks: (value, title, tooltip) of each place to look from.
+    """
+    colours = "".join(
+        f'<button type="button" data-mode="{esc(value)}" aria-pressed="{"true" if value == mode else "false"}" '
+        f'onclick="{call("colours", value)}">{esc(title)}</button>'
+        for value, title in modes
+    )
+    views = "".join(
+        f'<button type="button" data-look="{esc(value)}" title="{esc(tip)}" '
+        f'onclick="{call("look", value)}">{esc(title)}</button>'
+        for value, title, tip in looks
+    )
+    content = f"<span><i>Colours</i>{colours}</span><span><i>Look at</i>{views}</span>"
+    return (
+        "(()=>{let e=document.getElementById('dbh-view');if(!e){e=document.createElement('div');e.id='dbh-view';"
+        f"e.className='dbh';document.body.appendChild(e);}}e.innerHTML={js(content)};}})()"
     )

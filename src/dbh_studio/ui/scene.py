@@ -14,18 +14,34 @@ from typing import Any, Literal, get_args
 import numpy as np
 import viser
 
-from dbh_studio.core.arrays import Float32, Float64
-from dbh_studio.core.display import HIGHLIGHT_YELLOW, TRUNK_RED, coarse_first_chunks, thin_to, tree_colour
+from dbh_studio.core.arrays import Float32, Float64, UInt8
+from dbh_studio.core.display import (
+    HIGHLIGHT_YELLOW,
+    TRUNK_RED,
+    coarse_first_chunks,
+    sample_for_display,
+    tree_colour,
+)
+from dbh_studio.core.reconstruction import TriangleMesh
+from dbh_studio.core.transforms import Similarity
 from dbh_studio.core.trunks import Trunk
 from dbh_studio.ui.display_cloud import DisplayCloud
+from dbh_studio.ui.shade import shaded
+from dbh_studio.ui.surface import glb_of
+from dbh_studio.ui.viewpoint import clear_side
 
 log = logging.getLogger(__name__)
 
 ColourMode = Literal["Original", "Segmentation (red)", "Segmentation (by tree)", "Height"]
 COLOUR_MODES: tuple[ColourMode, ...] = get_args(ColourMode)
 
+# A mesh is sent and drawn whole: viser thins nothing.
+MOST_FACES = 3_000_000
 _OVERLAY_BUDGET = 1_200_000
 _PER_TREE = 25_000
+# Narrower than viser's 75 degrees, at which upright stems near the edge look as if they leaned.
+_FOV_RAD = np.deg2rad(50.0)
+_RING_COLOUR = (20, 60, 190)
 
 
 class SceneView:
@@ -44,6 +60,9 @@ class SceneView:
         self._label_handles: dict[int, Any] = {}
         self._highlight: list[Any] = []
         self._frames: dict[str, Any] = {}
+        self._empty: list[Any] = []
+        self._mesh: Any = None
+        self._mesh_on = False
         self._stream_stop = threading.Event()
         self._lock = threading.RLock()
 
@@ -52,6 +71,9 @@ class SceneView:
     def show_plot(self, display: DisplayCloud) -> None:
         """Replace everything by this plot and look at it; the points arrive coarse first, in the background."""
         self.clear()
+        for handle in self._empty:
+            handle.remove()
+        self._empty = []
         self._display = display
         self._point_size = display.point_size
         for name in (
@@ -75,12 +97,29 @@ class SceneView:
         """Remove the plot from the picture."""
         self._stream_stop.set()
         with self._lock:
-            self.highlight(None, None)
+            self.highlight(None, None, None)
             for handle in self._frames.values():
                 if handle.name.count("/") == 1:
                     handle.remove()
+            if self._mesh is not None:
+                self._mesh.remove()
+            self._mesh, self._mesh_on = None, False
             self._frames, self._clouds, self._overlays, self._label_handles = {}, [], {}, {}
             self._display = None
+
+    def show_nothing_open(self) -> None:
+        """A floor and a word in place of a blank page."""
+        self.clear()
+        if not self._empty:
+            floor = self._scene.add_grid(
+                "/floor", 40.0, 40.0, cell_size=1.0, section_size=5.0, cell_color=(225, 228, 230),
+                section_color=(190, 195, 200), fade_distance=60.0,
+            )  # fmt: skip
+            word = self._scene.add_label(
+                "/word", "Open a point cloud in the panel to begin", position=(0.0, 0.0, 1.5), anchor="center-center",
+                font_screen_scale=1.4,
+            )  # fmt: skip
+            self._empty = [floor, word]
 
     def stop(self) -> None:
         """Stop sending: the tab is gone."""
@@ -120,26 +159,33 @@ class SceneView:
 
     # ---- trunks
 
-    def show_trunks(self, trunks: dict[int, tuple[Trunk, Float32, Float64, str]]) -> None:
+    def show_trunks(self, trunks: dict[int, tuple[Trunk, Float32, UInt8 | None, Float64]]) -> None:
         """Bring the overlays in step with the given trunks; unchanged ones are left alone.
 
         Args:
-            trunks: For each id: the trunk, its points (world), where its label goes (world), and the label's text.
+            trunks: For each id: the trunk, its points (world), their own colours, and where its number goes (world).
         """
         with self._lock, self._client.atomic():
             for trunk_id in set(self._overlays) - set(trunks):
                 self._remove_trunk(trunk_id)
             limit = min(_PER_TREE, _OVERLAY_BUDGET // max(len(trunks), 1))
-            for trunk_id, (trunk, points, anchor, text) in trunks.items():
+            for trunk_id, (trunk, points, rgb, anchor) in trunks.items():
                 known = self._overlays.get(trunk_id)
                 if known is None or known[0] is not trunk:
                     self._remove_trunk(trunk_id)
-                    shown = thin_to(points, limit)
-                    size = 1.25 * self._point_size
-                    red = self._add_points(f"/red/{trunk_id}", shown, TRUNK_RED, size)
-                    own = self._add_points(f"/tree/{trunk_id}", shown, tree_colour(trunk_id), size)
+                    red = self._add_trunk(f"/red/{trunk_id}", points, rgb, TRUNK_RED, limit, 1.25)
+                    own = self._add_trunk(f"/tree/{trunk_id}", points, rgb, tree_colour(trunk_id), limit, 1.25)
                     self._overlays[trunk_id] = (trunk, red, own)
-                self._set_label(trunk_id, anchor, text)
+                self._set_label(trunk_id, anchor, str(trunk_id))
+
+    def _add_trunk(
+        self, name: str, points: Float32, rgb: UInt8 | None, colour: tuple[int, int, int], limit: int, size: float
+    ) -> Any:
+        """One trunk over the cloud: thinned, larger by a factor than the cloud's points, so that it covers them."""
+        chosen = np.sort(sample_for_display(len(points), limit))
+        shown = points[chosen]
+        colours = shaded(shown, colour, None if rgb is None else rgb[chosen])
+        return self._add_points(name, shown, colours, size * self._point_size)
 
     def _set_label(self, trunk_id: int, anchor: Float64, text: str) -> None:
         label = self._label_handles.get(trunk_id)
@@ -161,22 +207,35 @@ class SceneView:
         if label is not None:
             label.remove()
 
-    def highlight(self, points: Float32 | None, ring: Float32 | None) -> None:
+    def highlight(self, points: Float32 | None, rgb: UInt8 | None, ring: Float32 | None) -> None:
         """Draw one trunk in yellow with its measured ring, or nothing."""
         with self._lock:
             for handle in self._highlight:
                 handle.remove()
             self._highlight = []
             if points is not None and len(points):
-                shown = thin_to(points, 2 * _PER_TREE)
-                self._highlight.append(self._add_points("/highlight", shown, HIGHLIGHT_YELLOW, 1.3 * self._point_size))
+                marked = self._add_trunk("/highlight", points, rgb, HIGHLIGHT_YELLOW, 2 * _PER_TREE, 1.3)
+                self._highlight.append(marked)
             if ring is not None and len(ring) > 2:
                 segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)
                 self._highlight.append(
                     self._scene.add_line_segments(
-                        "/ring", segments, (230, 60, 0), thickness=4.0, thickness_units="screen"
+                        "/ring", segments, _RING_COLOUR, thickness=5.0, thickness_units="screen"
                     )
                 )
+
+    # ---- the mesh
+
+    def show_mesh(self, mesh: TriangleMesh, world_from_source: Similarity, *, on: bool) -> None:
+        """Show the surface the cloud came with in place of the cloud, or the cloud; it is sent when first wanted."""
+        with self._lock:
+            self._mesh_on = on
+            if self._mesh is None and on:
+                content = glb_of(mesh, world_from_source)
+                self._mesh = self._scene.add_glb("/mesh", content, cast_shadow=False, receive_shadow=False)
+            elif self._mesh is not None:
+                self._mesh.visible = on
+            self._apply_visibility()
 
     # ---- how it looks
 
@@ -200,8 +259,8 @@ class SceneView:
             return
         by_height = self._mode == "Height" and self._display.has_rgb
         wanted = {
-            "/rgb": not by_height,
-            "/height": by_height,
+            "/rgb": not by_height and not self._mesh_on,
+            "/height": by_height and not self._mesh_on,
             "/rgb/crown": self._crowns_on,
             "/height/crown": self._crowns_on,
             "/red": self._mode == "Segmentation (red)",
@@ -227,32 +286,41 @@ class SceneView:
     # ---- the camera
 
     def look_at_plot(self, *, animate: bool = True) -> None:
-        """From just outside the plot, a little above the heads: stems are seen, not crowns."""
+        """The whole plot, from a little above the heads: stems are seen, not crowns."""
         if self._display is None:
             return
         centre, radius = self._display.centre_and_radius()
-        self._move(centre + radius * np.array([0.15, -1.55, 0.42]), centre, animate=animate)
+        # The near corners are closer than the middle, hence the third more.
+        distance = 1.35 * radius / self._half_width()
+        self._move(centre + distance * np.array([0.1, -0.95, 0.28]), centre, animate=animate)
 
     def look_from_top(self) -> None:
         """Straight down, north up."""
         if self._display is None:
             return
         centre, radius = self._display.centre_and_radius()
-        self._move(centre + np.array([0.0, -1e-3, 2.4 * radius + 8.0]), centre, up=(0.0, 1.0, 0.0))
+        height = 1.1 * radius / min(self._half_width(), float(np.tan(_FOV_RAD / 2))) + 8.0
+        self._move(centre + np.array([0.0, -1e-3, height]), centre, up=(0.0, 1.0, 0.0))
 
     def look_from_side(self) -> None:
         """Level, from the south, at stem height."""
         if self._display is None:
             return
         centre, radius = self._display.centre_and_radius()
-        self._move(centre + np.array([0.0, -2.0 * radius, 0.05 * radius]), centre)
+        self._move(centre + np.array([0.0, -1.2 * radius / self._half_width() - radius, 0.05 * radius]), centre)
 
-    def fly_to(self, target: Float64, *, distance: float = 4.5) -> None:
-        """Stand in front of a point, on the side one is looking from."""
+    def _half_width(self) -> float:
+        """Half the width of the picture, one unit in front of the camera."""
+        return float(np.tan(_FOV_RAD / 2)) * float(np.clip(self._client.camera.aspect, 0.3, 3.0))
+
+    def fly_to(self, target: Float64, *, distance: float = 6.0) -> None:
+        """Stand in front of a point, on the side one is looking from unless something is in the way."""
         away = np.asarray(self._client.camera.position, float) - target
         away[2] = 0.0
         norm = float(np.linalg.norm(away))
         away = away / norm if norm > 1e-6 else np.array([0.0, -1.0, 0.0])
+        if self._display is not None:
+            away = clear_side(self._display.points, target, away, distance)
         self._move(target + distance * away + np.array([0.0, 0.0, 0.2 * distance]), target)
 
     def _move(
@@ -266,7 +334,7 @@ class SceneView:
         camera = self._client.camera
         start, start_look = np.asarray(camera.position, float), np.asarray(camera.look_at, float)
         n_steps = 8 if animate else 1
-        camera.up_direction = up
+        camera.up_direction, camera.fov = up, _FOV_RAD
         for step in range(1, n_steps + 1):
             eased = step / n_steps
             eased = eased * eased * (3 - 2 * eased)

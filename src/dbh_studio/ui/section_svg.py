@@ -14,16 +14,18 @@ import numpy as np
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal
 from dbh_studio.core.section import CrossSection
+from dbh_studio.ui.bridge import call
+from dbh_studio.ui.html import CURVE_TITLES
 
-CURVE_COLOURS: Mapping[str, str] = {"fourier": "#e8590c", "ellipse": "#1098ad", "bspline": "#c2255c"}
-CURVE_TITLES: Mapping[str, str] = {"fourier": "Fourier", "ellipse": "Ellipse", "bspline": "B-spline"}
+CURVE_COLOURS: Mapping[str, str] = {"fourier": "#d9480f", "ellipse": "#0b7285", "bspline": "#a61e8c"}
+_USED, _LEFT_OUT = "#2b8a3e", "#868e96"
 
 _SIZE = 340
 _MAX_DOTS = 700
 
 
 def section_svg(result: DbhEstimate | Refusal, *, curve: str) -> str:
-    """The picture of one stem's section; empty where there is no section to draw.
+    """The picture of one stem's section with its curves to choose from; empty where there is no section to draw.
 
     Args:
         result: The estimate or the refusal.
@@ -35,7 +37,7 @@ def section_svg(result: DbhEstimate | Refusal, *, curve: str) -> str:
     fits = {name: fit for name, fit in result.fits.items() if isinstance(fit, CurveFit)}
     frame = _Frame.around(section, fits.get(curve))
     parts = [
-        f'<svg class="dbh-section" viewBox="0 0 {_SIZE} {_SIZE}" role="img" '
+        f'<div class="dbh-cut"><svg class="dbh-section" viewBox="0 0 {_SIZE} {_SIZE}" role="img" '
         f'aria-label="Cross-section at {section.hom_m:.2f} m">',
         _grid(frame),
         _dots(frame, section, fits.get(curve)),
@@ -46,6 +48,7 @@ def section_svg(result: DbhEstimate | Refusal, *, curve: str) -> str:
         _scale_bar(frame),
         "</svg>",
         _legend(result, curve),
+        "</div>",
     ]
     return "".join(parts)
 
@@ -78,10 +81,10 @@ def _dots(frame: _Frame, section: CrossSection, fit: CurveFit | None) -> str:
     pixels = frame.pixels(section.uv_m)[::step]
     inside = ((pixels > 0) & (pixels < _SIZE)).all(axis=1)
     inlier = np.zeros(len(pixels), bool) if fit is None else fit.inliers[::step]
-    groups = (("#868e96", inside & ~inlier), ("#2b8a3e", inside & inlier))
+    groups = ((_LEFT_OUT, inside & ~inlier), (_USED, inside & inlier))
     return "".join(
         f'<path d="{"".join(f"M{x:.1f} {y:.1f}h0" for x, y in pixels[chosen])}" '
-        f'stroke="{colour}" stroke-width="3" stroke-linecap="round" fill="none" opacity="0.75"/>'
+        f'stroke="{colour}" stroke-width="3.6" stroke-linecap="round" fill="none" opacity="0.7"/>'
         for colour, chosen in groups
         if chosen.any()
     )
@@ -90,7 +93,7 @@ def _dots(frame: _Frame, section: CrossSection, fit: CurveFit | None) -> str:
 def _outline(frame: _Frame, name: str, fit: CurveFit, *, chosen: bool) -> str:
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in frame.pixels(fit.outline_uv_m))
     colour = CURVE_COLOURS.get(name, "#495057")
-    width, dash = (3.2, "") if chosen else (1.6, ' stroke-dasharray="6 4"')
+    width, dash = (4, "") if chosen else (2, ' stroke-dasharray="7 5"')
     return (
         f'<polygon data-curve="{escape(name)}" points="{points}" fill="none" stroke="{colour}" '
         f'stroke-width="{width}"{dash} stroke-linejoin="round"/>'
@@ -110,28 +113,31 @@ def _scale_bar(frame: _Frame) -> str:
     width, y = frame.length_px(length_m), _SIZE - 14
     return (
         f'<path d="M12 {y}h{width:.1f}" stroke="#343a40" stroke-width="3"/>'
-        f'<text x="12" y="{y - 7}" font-size="13" font-family="sans-serif" fill="#343a40">{100 * length_m:g} cm</text>'
+        f'<text x="12" y="{y - 7}" font-size="18" font-family="sans-serif" fill="#343a40">{100 * length_m:g} cm</text>'
     )
 
 
 def _legend(result: DbhEstimate | Refusal, curve: str) -> str:
-    items = []
-    for name, fit in result.fits.items():
-        title = CURVE_TITLES.get(name, name)
-        colour = CURVE_COLOURS.get(name, "#495057")
+    """One button per curve, which makes it the chosen one, and what the dots mean."""
+    buttons = []
+    for name in sorted(result.fits, key=lambda n: list(CURVE_TITLES).index(n) if n in CURVE_TITLES else 99):
+        fit, title = result.fits[name], CURVE_TITLES.get(name, name)
+        value = "no fit"
         if isinstance(fit, CurveFit):
+            is_given = isinstance(result, DbhEstimate)
             definition = result.definition if isinstance(result, DbhEstimate) else "curve"
-            value = f"{100 * fit.diameter_m(definition):.1f} cm" if isinstance(result, DbhEstimate) else "shown only"
-        else:
-            value = "no fit"
-        weight = "600" if name == curve else "400"
-        items.append(
-            f'<span style="white-space:nowrap;font-weight:{weight}"><span style="color:{colour}">&#9644;</span> '
-            f"{escape(title)} {escape(value)}</span>"
+            value = f"{100 * fit.diameter_m(definition):.1f} cm" if is_given else "shown only"
+        chosen = name == curve
+        line = "solid" if chosen else "dashed"
+        tip = "This curve gives the diameter" if chosen else f"Let the {title} curve give the diameter of every tree"
+        buttons.append(
+            f'<button type="button" data-choose="{escape(name)}" aria-pressed="{"true" if chosen else "false"}" '
+            f'title="{escape(tip)}" onclick="{call("curve", name)}">'
+            f'<i style="border-top:3px {line} {CURVE_COLOURS.get(name, "#495057")}"></i>'
+            f"<span>{escape(title)}</span><span>{escape(value)}</span></button>"
         )
-    dots = '<span style="white-space:nowrap"><span style="color:#2b8a3e">&#9679;</span> used '
-    dots += '<span style="color:#868e96">&#9679;</span> left out</span>'
-    return (
-        '<div style="display:flex;flex-wrap:wrap;gap:2px 12px;font-size:12.5px;padding:6px 2px">'
-        f"{''.join(items)}{dots}</div>"
+    dots = "".join(
+        f'<span><i style="background:{colour}"></i>{text}</span>'
+        for colour, text in ((_USED, "points used"), (_LEFT_OUT, "left out"))
     )
+    return f'<div class="dbh-legend">{"".join(buttons)}<div class="dbh-dots">{dots}</div></div>'

@@ -48,10 +48,10 @@ class PlotStatus:
         n_refused = self.n_trunks - self.n_measured - self.n_waiting
         refused = f", {n_refused} could not be measured" if n_refused else ""
         if self.n_waiting:
-            return f"{self.n_trunks} trunks found. Measuring, {self.n_waiting} to go …"
+            return f"{self.n_trunks} trunks found, {self.n_waiting} not measured yet."
         hints: dict[StepName, str] = {
             "open": "Open a point cloud, or upload one.",
-            "scale": "This cloud has no scale yet. Set how long one unit is before measuring.",
+            "scale": "This cloud has no scale yet. Say how long one unit of it is before measuring.",
             "trunks": "Press Find trunks.",
             "inspect": f"{self.n_trunks} trunks found{refused}. Click a trunk in the picture or a row in the table.",
             "export": f"{self.n_measured} of {self.n_trunks} trees measured. Look through them, then export.",

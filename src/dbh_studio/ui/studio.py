@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import platformdirs
 
 from dbh_studio.app import pipeline
@@ -20,7 +21,7 @@ from dbh_studio.app.document import Document
 from dbh_studio.app.jobs import Job, run_job
 from dbh_studio.app.opening import open_plot, plot_name, read_cloud
 from dbh_studio.app.session import Change, Session
-from dbh_studio.core.arrays import Int32
+from dbh_studio.core.arrays import Int32, Int64
 from dbh_studio.core.progress import Progress
 from dbh_studio.core.reconstruction import Reconstruction
 from dbh_studio.errors import CancelledError, StudioError
@@ -68,7 +69,6 @@ class Studio:
         self._job: JobState | None = None
         self._stop_job: Callable[[], object] | None = None
         self._exported: Document | None = None
-        self._labels: tuple[object, Int32] | None = None
         self._lock = threading.RLock()
         server.viser.initial_camera.position = (0.0, -20.0, 6.0)
         server.viser.initial_camera.look_at = (0.0, 0.0, 1.0)
@@ -104,7 +104,7 @@ class Studio:
         display = self._make_display(session)
         with self._lock:
             before, self.session, self.display = self.session, session, display
-            self.segmentation_notes, self._exported, self._labels = (), None, None
+            self.segmentation_notes, self._exported = (), None
         if before is not None:
             before.close()
         session.subscribe(self._session_changed)
@@ -147,15 +147,21 @@ class Studio:
             return f"NOT SAVED: {saver.status.problem}"
         return f"saved in {saver.folder.name}" if saver.status.state == "saved" else "saving …"
 
-    def display_labels(self) -> Int32:
-        """(M,) trunk id of every point of the display cloud, 0 where none."""
+    def trunk_ids_at(self, rows: Int64) -> Int32:
+        """(K,) trunk id of (K,) points of the display cloud, 0 where none.
+
+        Looked up for the few points under a click: labels of the whole cloud would cost the first click after every
+        edit a tenth of a second for ten million points.
+        """
         session, display = self.session, self.display
         assert session is not None and display is not None
-        key = (session.document.trunks, display)
-        if self._labels is None or self._labels[0] != key:
-            labels = session.document.trunks.labels(len(session.cloud))[display.indices]
-            self._labels = (key, labels)
-        return self._labels[1]
+        points = display.indices[rows].astype(np.int32)
+        ids = np.zeros(len(points), np.int32)
+        for trunk in session.document.trunks:
+            if len(trunk):
+                at = np.minimum(np.searchsorted(trunk.points, points), len(trunk) - 1)
+                ids[trunk.points[at] == points] = trunk.id
+        return ids
 
     def exported(self, document: Document) -> None:
         """Remember which state of the plot was handed in."""

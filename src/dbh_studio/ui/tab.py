@@ -6,7 +6,6 @@ import logging
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-import viser
 
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.arrays import Float32, Float64
@@ -16,14 +15,15 @@ from dbh_studio.settings import Settings
 from dbh_studio.ui import html
 from dbh_studio.ui.bind import SceneClick, TabWorker
 from dbh_studio.ui.bridge import Bridge
-from dbh_studio.ui.panels.base import Panel, set_content, set_value
+from dbh_studio.ui.panels.base import Panel, set_content
 from dbh_studio.ui.panels.export import ExportPanel
 from dbh_studio.ui.panels.inspect import InspectPanel, row_of
 from dbh_studio.ui.panels.open import OpenPanel
 from dbh_studio.ui.panels.scale import ScalePanel
 from dbh_studio.ui.panels.trunks import TrunksPanel
-from dbh_studio.ui.scene import COLOUR_MODES, ColourMode, SceneView
+from dbh_studio.ui.scene import SceneView
 from dbh_studio.ui.steps import PlotStatus, StepName
+from dbh_studio.ui.view_controls import ViewControls
 from dbh_studio.ui.view_state import ViewState
 
 if TYPE_CHECKING:
@@ -51,6 +51,9 @@ class Tab:
         self.bridge.on("sort", self._sort_chosen)
         self.bridge.on("undo", lambda _: self._undo_pressed())
         self.bridge.on("redo", lambda _: self._redo_pressed())
+        self.bridge.on("cancel", lambda _: self.studio.cancel_job())
+        self.bridge.on("measure", lambda _: self.studio.measure_missing())
+        self.bridge.on("neighbour", lambda n: self._step_tree(1 if n == 1 else -1))
         worker.on_scene_click(self.client, self._scene_clicked)
         worker.on_close(self.scene.stop)
         self.adopt_session()
@@ -61,29 +64,12 @@ class Tab:
         gui = self.client.gui
         self.bridge.run(html.style_js())
         self._header = gui.add_html("")
-        self._job_text = gui.add_html("", visible=False)
-        self._job_bar = gui.add_progress_bar(0.0, visible=False, color="green")
-        self._cancel = gui.add_button("Cancel", color="red", icon=viser.Icon.X, visible=False)
-        self.worker.on_cancel(self._cancel, self.studio.cancel_job)
+        self._job_box = gui.add_html("", visible=False)
         self.panels: tuple[Panel, ...] = tuple(
             panel(self) for panel in (OpenPanel, ScalePanel, TrunksPanel, InspectPanel, ExportPanel)
         )
-        self._build_view_controls()
+        self.controls = ViewControls(self)
         self._add_commands()
-
-    def _build_view_controls(self) -> None:
-        gui, worker = self.client.gui, self.worker
-        with gui.add_folder("View"):
-            self._mode = gui.add_dropdown("Colours", COLOUR_MODES)
-            worker.on_update(self._mode, self._mode_chosen)
-            self._views = gui.add_button_group("Look", ("Plot", "Top", "Side", "Tree"))
-            worker.on_update(self._views, self._view_chosen)
-            self._labels = gui.add_checkbox("Tree numbers", True)
-            worker.on_update(self._labels, self.scene.set_labels)
-            self._crowns = gui.add_checkbox("Crowns", False, hint="points more than 6 m above the ground")
-            worker.on_update(self._crowns, self.scene.set_crowns)
-            self._size = gui.add_slider("Point size", 0.3, 3.0, 0.1, 1.0)
-            worker.on_update(self._size, self.scene.set_point_size, coalesce=True)
 
     def _add_commands(self) -> None:
         # W A S D Q E and the arrow keys already move the camera.
@@ -92,7 +78,8 @@ class Tab:
             ("Redo", "Z", "cmd/ctrl+shift", self._redo_pressed),
             ("Next tree", "N", None, lambda: self._step_tree(1)),
             ("Previous tree", "P", None, lambda: self._step_tree(-1)),
-            ("Fly to the tree", "F", None, self._fly_to_selected),
+            ("Fly to the tree", "F", None, self.fly_to_selected),
+            ("Next colours", "C", None, self.controls.next_mode),
             ("Look from the top", "T", None, self.scene.look_from_top),
             ("Whole plot", "H", None, self.scene.look_at_plot),
         ):
@@ -119,6 +106,13 @@ class Tab:
         """Show the plot that is open now from scratch: on connect, and after another one was opened."""
         self.view.selected, self.view.n_inspected = None, 0
         self.view.step = self.status().next_step()
+        session = self.session
+        check = session.data_check if session is not None else None
+        if session is not None and len(session.document.trunks):
+            self._show_in_red()
+        elif check is not None and any(finding.level == "warn" for finding in check.findings):
+            # A doubt about the file is read before anything is pressed.
+            self.view.step = "open"
         self.refresh()
         self.client.flush()
         self.show_cloud()
@@ -127,10 +121,10 @@ class Tab:
         """Send the cloud as it is now turned and scaled."""
         display = self.studio.display
         if display is None:
-            self.scene.clear()
+            self.scene.show_nothing_open()
             return
         self.scene.show_plot(display)
-        self.scene.set_crowns(bool(self._crowns.value))
+        self.controls.show_plot()
         self.refresh_trunks()
 
     def session_changed(self, change: Change) -> None:
@@ -150,11 +144,13 @@ class Tab:
             self._trunks_appeared()
 
     def _trunks_appeared(self) -> None:
-        """The first trunks of a plot: show them in red and go on to the next step."""
-        if self.view.mode == "Original":
-            set_value(self._mode, "Segmentation (red)")
-            self._mode_chosen("Segmentation (red)")
+        """The first trunks of a plot: show them and go on to the next step."""
+        self._show_in_red()
         self.go_to_next_step()
+
+    def _show_in_red(self) -> None:
+        if self.view.mode == "Original":
+            self.controls.set_mode("Segmentation (red)")
 
     def status(self) -> PlotStatus:
         """What is done of this plot."""
@@ -196,6 +192,7 @@ class Tab:
             saved=self.studio.saved_text(),
             undo=session.undo_label if session is not None else "",
             redo=session.redo_label if session is not None else "",
+            is_busy=self._job_box.visible,
         )
         set_content(self._header, content)
 
@@ -204,21 +201,22 @@ class Tab:
         session = self.session
         if session is None or self.studio.display is None:
             return
-        points_world = session.points_world()
+        points_world, rgb = session.points_world(), session.cloud.rgb
         shown = {}
         for trunk in session.document.trunks:
             points = points_world[trunk.points]
-            shown[trunk.id] = (trunk, points, _label_anchor(points), str(trunk.id))
+            shown[trunk.id] = (trunk, points, None if rgb is None else rgb[trunk.points], _label_anchor(points))
         self.scene.show_trunks(shown)
         self._refresh_highlight()
 
     def _refresh_highlight(self) -> None:
         session, selected = self.session, self.view.selected
         if session is None or selected is None:
-            self.scene.highlight(None, None)
+            self.scene.highlight(None, None, None)
             return
-        points = session.points_world()[session.document.trunks[selected].points]
-        self.scene.highlight(points, self._ring_world(selected))
+        rows, rgb = session.document.trunks[selected].points, session.cloud.rgb
+        own_rgb = None if rgb is None else rgb[rows]
+        self.scene.highlight(session.points_world()[rows], own_rgb, self._ring_world(selected))
 
     def _ring_world(self, trunk_id: int) -> Float32 | None:
         """(M, 3) outline of the measured curve in the world frame."""
@@ -228,23 +226,26 @@ class Tab:
         fit = stem.result.fits[stem.result.curve]
         if not isinstance(fit, CurveFit):
             return None
-        # A little outside the bark, or the trunk's own points would hide it.
-        centre = fit.outline_uv_m.mean(axis=0)
-        outline = centre + (fit.outline_uv_m - centre) * (1.0 + 0.06 / fit.diameter_m("curve"))
+        # A little outside the bark, or the trunk's own points, which are drawn as discs, would hide it.
+        point_size = self.studio.display.point_size if self.studio.display is not None else 0.0
+        centre, margin = fit.outline_uv_m.mean(axis=0), 0.02 + 0.8 * point_size
+        outline = centre + (fit.outline_uv_m - centre) * (1.0 + 2.0 * margin / fit.diameter_m("curve"))
         flat = np.column_stack([outline, np.zeros(len(outline))])
         ring = stem.result.section.stem_from_section.apply(flat)
         return (ring + np.array([0.0, 0.0, stem.z_ground_m])).astype(np.float32)
 
     def show_job(self, job: JobState | None) -> None:
         """Show the running job, or that none runs."""
-        running = job is not None
         with self.client.atomic():
             if job is not None:
-                set_content(self._job_text, html.message(f"{job.title}: {job.message}" if job.message else job.title))
-                set_value(self._job_bar, 100.0 * job.fraction)
-            for handle in (self._job_text, self._job_bar, self._cancel):
-                if handle.visible != running:
-                    handle.visible = running
+                set_content(self._job_box, html.job_box(job.title))
+            if self._job_box.visible != (job is not None):
+                self._job_box.visible = job is not None
+                self.refresh_header()
+                for panel in self.panels:
+                    panel.set_busy(job is not None)
+        if job is not None:
+            self.bridge.run(html.job_js(job.fraction, job.message))
         self.client.flush()
 
     def table_rows(self) -> list[html.TableRow]:
@@ -257,7 +258,7 @@ class Tab:
         for trunk_id in document.trunks.ids:
             record = document.record(trunk_id)
             if trunk_id in waiting:
-                rows.append(html.TableRow(trunk_id, None, "", None, "being measured …"))
+                rows.append(html.TableRow(trunk_id, None, "", None, "not measured yet"))
             else:
                 result = session.measurement(trunk_id).result
                 rows.append(row_of(trunk_id, result, species=record.species, note=record.note))
@@ -280,7 +281,7 @@ class Tab:
         self.client.flush()
         self._refresh_highlight()
         if fly and trunk_id is not None:
-            self._fly_to_selected()
+            self.fly_to_selected()
 
     def _scene_clicked(self, click: SceneClick) -> None:
         session, display = self.session, self.studio.display
@@ -289,7 +290,7 @@ class Tab:
         hit = display.picking.pick(click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
         if hit is None:
             return
-        labels = self.studio.display_labels()[hit.surface]
+        labels = self.studio.trunk_ids_at(hit.surface)
         ids, counts = np.unique(labels[labels > 0], return_counts=True)
         if len(ids) and counts.max() >= _MIN_SHARE * len(labels):
             self.select(int(ids[counts.argmax()]))
@@ -322,7 +323,8 @@ class Tab:
         at = ids.index(self.view.selected) + step if self.view.selected in ids else (0 if step > 0 else -1)
         self.select(ids[at % len(ids)], fly=True)
 
-    def _fly_to_selected(self) -> None:
+    def fly_to_selected(self) -> None:
+        """Look at the chosen tree at breast height; nothing where none is chosen."""
         session, selected = self.session, self.view.selected
         if session is None or selected is None:
             return
@@ -332,19 +334,6 @@ class Tab:
         else:
             target = np.median(session.points_world()[session.document.trunks[selected].points], axis=0).astype(float)
         self.scene.fly_to(target)
-
-    def _mode_chosen(self, mode: ColourMode) -> None:
-        self.view.mode = mode
-        self.scene.set_mode(mode)
-
-    def _view_chosen(self, choice: str) -> None:
-        actions = {
-            "Plot": self.scene.look_at_plot,
-            "Top": self.scene.look_from_top,
-            "Side": self.scene.look_from_side,
-            "Tree": self._fly_to_selected,
-        }
-        actions[choice]()
 
     def _undo_pressed(self) -> None:
         self.require_session().undo()

@@ -29,6 +29,9 @@ class Panel:
     def refresh(self) -> None:
         """Show the plot as it is now; cheap where nothing changed."""
 
+    def set_busy(self, busy: bool) -> None:
+        """Lock what cannot be started while a job runs."""
+
     def show(self, visible: bool) -> None:
         """Show or hide the whole panel."""
         if self.folder.visible != visible:
@@ -45,3 +48,9 @@ def set_content(handle: Any, content: str) -> None:
     """Assign HTML only where it differs: the same text again would still reset the scroll position."""
     if handle.content != content:
         handle.content = content
+
+
+def set_disabled(handle: Any, disabled: bool) -> None:
+    """Lock or release an input, where it is not so already."""
+    if handle.disabled != disabled:
+        handle.disabled = disabled

@@ -29,19 +29,20 @@ class ExportPanel(Panel):
             return
         results = [session.measurement(i).result for i in session.document.trunks.ids if i not in session.unmeasured()]
         diameters = [result.dbh_cm for result in results if isinstance(result, DbhEstimate)]
+        n_without = len(results) - len(diameters)
         pairs = [
-            ("Stems", str(len(session.document.trunks))),
+            ("Trees", str(len(session.document.trunks))),
             ("With a diameter", str(len(diameters))),
-            ("Without, reason in the file", str(len(results) - len(diameters))),
+            ("Without", f"{n_without} (the file says why)" if n_without else "0"),
         ]
         if diameters:
-            pairs.append(
-                (
-                    "Mean, range",
-                    f"{sum(diameters) / len(diameters):.1f} cm, {min(diameters):.1f}–{max(diameters):.1f} cm",
-                )
-            )
-        pairs.append(("Saved plot", self.tab.studio.saved_text()))
+            mean = sum(diameters) / len(diameters)
+            pairs += [("Mean DBH", f"{mean:.1f} cm"), ("Range", f"{min(diameters):.1f}–{max(diameters):.1f} cm")]
+        measure = session.document.settings.measure
+        pairs += [
+            ("Breast height", f"{measure.breast_height_m:.2f} m"),
+            ("Curve", html.CURVE_TITLES.get(measure.curve, measure.curve)),
+        ]
         set_content(self._state, f'<div class="dbh">{html.facts(pairs)}</div>')
 
     def _export(self) -> None:
@@ -51,4 +52,4 @@ class ExportPanel(Panel):
         name = f"{document.plot_id}_inventory.csv"
         self.tab.client.send_file_download(name, content, save_immediately=True)
         self.tab.studio.exported(document)
-        self.tab.worker.notify("Inventory exported", f"{name}, {len(document.trunks)} stems.", "success")
+        self.tab.worker.notify("Inventory exported", f"{name}, {len(document.trunks)} trees.", "success")

@@ -2,47 +2,63 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any, get_args
+
 import viser
 
 from dbh_studio.app import commands
 from dbh_studio.core.dbh import DbhEstimate
 from dbh_studio.core.inventory import TREE_STATUSES
 from dbh_studio.errors import CommandError
+from dbh_studio.settings import CurveName
 from dbh_studio.ui import html
 from dbh_studio.ui.forms import SettingsForm
 from dbh_studio.ui.panels.base import Panel, set_content, set_value
-from dbh_studio.ui.section_svg import CURVE_TITLES, section_svg
+from dbh_studio.ui.section_svg import section_svg
 
 _STATUS_TITLES = {"": "not said", "live": "live", "dead": "dead"}
+_BREAST_HEIGHTS = {"1.30 m (Europe, Canada)": 1.30, "1.37 m (USA)": 1.37, "1.40 m (New Zealand)": 1.40}
+_OWN_HEIGHT = "own, set below"
+_FIRST = ("curve", "breast_height_m", "band_below_m", "band_above_m", "definition", "min_coverage_deg")
 
 
 class InspectPanel(Panel):
-    """The card of the chosen tree, what a person says about it, how it is measured, and the table."""
+    """The table, the card of the chosen tree, what a person says about it, and how it is measured.
+
+    The table comes first and keeps its height, so that nothing jumps while one goes from tree to tree.
+    """
 
     step = "inspect"
 
     def build(self) -> None:
         """Add the inputs."""
         gui, worker = self.gui, self.tab.worker
+        self._table = gui.add_html("")
         self._card = gui.add_html("")
-        self._section = gui.add_html("")
+        self._height = gui.add_dropdown(
+            "Breast height", (*_BREAST_HEIGHTS, _OWN_HEIGHT), hint="of every tree; takes effect at once"
+        )
+        worker.on_update(self._height, self._height_chosen)
+        self.tab.bridge.on("curve", self._curve_chosen)
         with gui.add_folder("About this tree", expand_by_default=False, visible=False) as self._about:
             self._species = gui.add_text("Species", "")
             self._status = gui.add_dropdown("Status", tuple(_STATUS_TITLES[status] for status in TREE_STATUSES))
             self._note = gui.add_text("Note", "")
-            worker.on_click(gui.add_button("Keep", icon=viser.Icon.CHECK), self._keep_record)
+            worker.on_click(gui.add_button("Keep", icon=viser.Icon.CHECK, color="green"), self._keep_record)
             delete = gui.add_button("Delete this trunk", icon=viser.Icon.TRASH, color="red", hint="Undo brings it back")
             worker.on_click(delete, self._delete)
-        self._table = gui.add_html("")
         with gui.add_folder("How diameters are measured", expand_by_default=False):
-            self._form = SettingsForm(gui, self.tab.settings().measure)
-            worker.on_click(gui.add_button("Measure again", icon=viser.Icon.REFRESH), self._measure_again)
+            self._form = SettingsForm(gui, self.tab.settings().measure, first=_FIRST)
+            again = gui.add_button("Measure again", icon=viser.Icon.REFRESH, color="green")
+            worker.on_click(again, self._measure_again)
 
     def refresh(self) -> None:
         """Show the chosen tree and all trees as they are now."""
-        session = self.tab.session
-        if session is not None:
-            self._form.show(session.document.settings.measure)
+        measure = self.tab.settings().measure
+        self._form.show(measure)
+        known = {metres: title for title, metres in _BREAST_HEIGHTS.items()}
+        set_value(self._height, known.get(measure.breast_height_m, _OWN_HEIGHT))
         self.refresh_card()
         self.refresh_table()
 
@@ -51,15 +67,11 @@ class InspectPanel(Panel):
         session, selected = self.tab.session, self.tab.view.selected
         if session is None or selected is None or selected not in session.document.trunks:
             self._about.visible = False
-            set_content(self._card, html.message("Click a trunk in the picture, or a row below.") if session else "")
-            set_content(self._section, "")
+            set_content(self._card, html.no_tree_card() if session and len(session.document.trunks) else "")
             return
-        settings = session.document.settings.measure
         result = session.measurement(selected).result
-        title = CURVE_TITLES.get(settings.curve, settings.curve)
-        set_content(self._card, html.tree_card(selected, result, curve_title=title))
-        picture = section_svg(result, curve=settings.curve)
-        set_content(self._section, f'<div class="dbh">{picture}</div>' if picture else "")
+        picture = section_svg(result, curve=session.document.settings.measure.curve)
+        set_content(self._card, html.tree_card(selected, result, section=picture))
         self._show_record(selected)
 
     def refresh_table(self) -> None:
@@ -98,15 +110,30 @@ class InspectPanel(Panel):
         self.tab.require_session().do(commands.delete_trunk(self._selected()))
 
     def _measure_again(self) -> None:
-        values = self._form.read().model_dump()
-        self.tab.require_session().do(commands.change_settings("measure", **values))
+        self._change("Change how diameters are measured", **self._form.read().model_dump())
+
+    def _curve_chosen(self, curve: Any) -> None:
+        if curve in get_args(CurveName):
+            self._change(f"Measure by the {html.CURVE_TITLES[curve]} curve", curve=curve)
+
+    def _height_chosen(self, title: str) -> None:
+        if title in _BREAST_HEIGHTS:
+            height = _BREAST_HEIGHTS[title]
+            self._change(f"Measure at {height:.2f} m", breast_height_m=height)
+        else:
+            self.refresh()  # the choice stays what it was until a height is given
+            self.tab.worker.notify("Your own breast height", "Open “How diameters are measured” and type it there.")
+
+    def _change(self, label: str, **values: Any) -> None:
+        command = commands.change_settings("measure", **values)
+        self.tab.require_session().do(replace(command, label=label))
 
 
 def row_of(trunk_id: int, result: object, *, species: str, note: str) -> html.TableRow:
     """A table row of one measured stem."""
     said = ", ".join(text for text in (species, note) if text)
     if isinstance(result, DbhEstimate):
-        remark = said or "; ".join(result.flags)
+        remark = said or html.plain("; ".join(result.flags))
         return html.TableRow(trunk_id, result.dbh_cm, result.quality, result.section.coverage_deg, remark)
     reason = getattr(result, "reason", "")
-    return html.TableRow(trunk_id, None, "", None, ", ".join(text for text in (said, reason) if text))
+    return html.TableRow(trunk_id, None, "", None, ", ".join(text for text in (said, html.plain(reason)) if text))

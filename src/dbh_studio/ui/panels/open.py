@@ -10,10 +10,16 @@ from dbh_studio.app import commands
 from dbh_studio.core.transforms import UP_AXES
 from dbh_studio.errors import FileMissingError, StudioError
 from dbh_studio.ui import html
-from dbh_studio.ui.panels.base import Panel, set_content, set_value
+from dbh_studio.ui.panels.base import Panel, set_content, set_disabled, set_value
 from dbh_studio.ui.uploads import UploadedFile
 
 _UP_AS_FOUND = "as recognised"
+_VERDICTS = {
+    "ok": ("ok", "Data check: all well."),
+    "note": ("ok", "Data check: all well. Good to know:"),
+    "warn": ("todo", "Data check: look at the lines marked !"),
+    "stop": ("stop", "Data check: settle the line marked ✕ before measuring."),
+}
 
 
 class OpenPanel(Panel):
@@ -29,16 +35,17 @@ class OpenPanel(Panel):
             "",
             hint="on the computer the studio runs on: a cloud, a mesh, a folder, or a saved NAME.dbh",
         )
-        open_button = gui.add_button("Open", icon=viser.Icon.FOLDER_OPEN, color="green")
-        tab.worker.on_click(open_button, self._open)
+        self._open_button = gui.add_button("Open", icon=viser.Icon.FOLDER_OPEN, color="green")
+        tab.worker.on_click(self._open_button, self._open)
         suffixes = tab.studio.suffixes()
-        upload = gui.add_upload_button(
+        self._upload = gui.add_upload_button(
             "Upload a cloud",
             icon=viser.Icon.UPLOAD,
+            color="gray",
             mime_type=",".join(suffixes),
-            hint="a large file is better opened by its path",
+            hint="from the computer you sit at; a large file is better opened by its path",
         )
-        tab.worker.on_upload(upload, self._uploaded, allowed_suffixes=suffixes, on_progress=self._uploading)
+        tab.worker.on_upload(self._upload, self._uploaded, allowed_suffixes=suffixes, on_progress=self._uploading)
         self._upload_bar = gui.add_progress_bar(0.0, visible=False)
         self._check = gui.add_html("")
         self._up = gui.add_dropdown("Up in the file", (_UP_AS_FOUND, *UP_AXES), visible=False, hint="turns the cloud")
@@ -54,9 +61,19 @@ class OpenPanel(Panel):
         set_value(self._path, str(session.document.source.path))
         check = session.data_check
         items = [("note", note, "") for note in session.notes]
+        verdict = ""
         if check is not None:
             items += [(finding.level, finding.message, finding.remedy) for finding in check.findings]
-        set_content(self._check, html.findings(items))
+            # A scale given since settles the line on units: the check is of the file, not of the plot.
+            settled = check.level == "stop" and session.document.scale.is_known
+            level, text = ("ok", "Data check: the scale has been set.") if settled else _VERDICTS[check.level]
+            verdict = html.message(text, level=level)
+        set_content(self._check, verdict + html.findings(items))
+
+    def set_busy(self, busy: bool) -> None:
+        """One plot at a time."""
+        set_disabled(self._open_button, busy)
+        set_disabled(self._upload, busy)
 
     def _open(self) -> None:
         text = self._path.value.strip().strip("\"'")

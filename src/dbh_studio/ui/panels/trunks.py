@@ -7,7 +7,10 @@ import viser
 from dbh_studio.app import commands
 from dbh_studio.ui import html
 from dbh_studio.ui.forms import SettingsForm
-from dbh_studio.ui.panels.base import Panel, set_content
+from dbh_studio.ui.panels.base import Panel, set_content, set_disabled
+
+_FIRST_GROUND = ("method", "cell_m")
+_FIRST_TRUNKS = ("min_diameter_cm", "max_diameter_cm", "min_arc_deg", "trunk_top_m", "use_existing_ids")
 
 
 class TrunksPanel(Panel):
@@ -19,12 +22,16 @@ class TrunksPanel(Panel):
         """Add the inputs."""
         gui, settings = self.gui, self.tab.settings()
         self._state = gui.add_html("")
-        button = gui.add_button("Find trunks", icon=viser.Icon.TREES, color="green")
-        self.tab.worker.on_click(button, self._find)
-        with gui.add_folder("Ground settings", expand_by_default=False):
-            self._ground = SettingsForm(gui, settings.ground)
+        self._button = gui.add_button("Find trunks", icon=viser.Icon.TREES, color="green")
+        self.tab.worker.on_click(self._button, self._find)
         with gui.add_folder("Trunk settings", expand_by_default=False):
-            self._trunks = SettingsForm(gui, settings.trunks)
+            self._trunks = SettingsForm(gui, settings.trunks, first=_FIRST_TRUNKS)
+        with gui.add_folder("Ground settings", expand_by_default=False):
+            self._ground = SettingsForm(gui, settings.ground, first=_FIRST_GROUND)
+
+    def set_busy(self, busy: bool) -> None:
+        """One job at a time."""
+        set_disabled(self._button, busy)
 
     def refresh(self) -> None:
         """Say what was found, and bring the settings in step."""
@@ -41,7 +48,9 @@ class TrunksPanel(Panel):
         elif n_trunks:
             notes = [("note", note, "") for note in self.tab.studio.segmentation_notes]
             found = html.message(
-                f"{n_trunks} trunks. Finding them again keeps the numbers of those found again.", level="ok"
+                f"{n_trunks} trunks found. You may change settings and find them again: a trunk found again keeps its "
+                "number, and Undo brings the old ones back.",
+                level="ok",
             )
             set_content(self._state, found + html.findings(notes))
         else:

@@ -1,0 +1,200 @@
+#!/usr/bin/env python3
+"""Make the pictures of the guide again: the studio on the demo plot, in a browser without a window.
+
+    .venv/bin/python tools/guide_pictures.py                     # all of them
+    .venv/bin/python tools/guide_pictures.py inspect export      # some
+
+Needs what the browser tests need. Takes some minutes where the browser draws in software.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageColor
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "ui"))
+
+import browser  # noqa: E402
+
+from dbh_studio.app.demo import demo_plot  # noqa: E402
+from dbh_studio.app.doctor import find_chromium  # noqa: E402
+from dbh_studio.core.cloud import PointCloud  # noqa: E402
+from dbh_studio.core.dbh import DbhEstimate  # noqa: E402
+from dbh_studio.io.ply import write_ply  # noqa: E402
+from dbh_studio.io.reader import read_reconstruction  # noqa: E402
+from dbh_studio.ui.server import start_server  # noqa: E402
+from dbh_studio.ui.studio import Studio  # noqa: E402
+
+SIZE = (1440, 900)
+LARGEST_BYTES = 300_000
+PATIENCE_S = 300.0
+PANEL = "the panel"
+# White, the three curves, the ring, the marks of good, fair, poor and refused, the bars of the hints.
+KEPT = [ImageColor.getrgb(c) for c in (
+    "#ffffff", "#d9480f", "#0b7285", "#a61e8c", "#143cbe", "#2b8a3e", "#e8890c", "#c92a2a", "#868e96", "#f59f00",
+    "#e03131", "#37b24d", "#1c7ed6", "#ebfbee", "#fff9db", "#fff5f5", "#e7f5ff", "#fff3bf", "#40c057", "#212529",
+)]  # fmt: skip
+
+
+class Photographer:
+    """Drives the studio like a person and keeps what is on the screen."""
+
+    def __init__(self, studio: Studio, page: Any, out: Path, wanted: list[str]) -> None:
+        self.studio, self.page, self.out, self.wanted = studio, page, out, wanted
+
+    def settle(self, seconds: float = 3.0) -> None:
+        """Wait for the studio, and for the drawing after it."""
+        if not self.studio.wait_idle(PATIENCE_S):
+            raise SystemExit("The studio did not come to rest.")
+        self.page.wait_for_timeout(1000 * seconds)
+        browser.close_notifications(self.page)
+
+    def take(self, name: str, clip: str = "") -> None:
+        """Save the window, or one element of it, small enough for a repository."""
+        if self.wanted and name not in self.wanted:
+            return
+        area = None
+        if clip == PANEL:
+            left = self.page.locator(".dbh-steps").bounding_box()["x"] - 10
+            area = {"x": left, "y": 0, "width": SIZE[0] - left, "height": 760}
+        elif clip:
+            area = self.page.locator(clip).first.bounding_box()
+        shot = self.page.screenshot(clip=area, timeout=120_000)
+        image = Image.open(io.BytesIO(shot)).convert("RGB")
+        path = self.out / f"{name}.png"
+        path.write_bytes(smallest(image))
+        print(f"{path.name}: {path.stat().st_size // 1000} kB")
+
+    def open(self, path: Path) -> None:
+        self.studio.open_plot(path)
+        self.page.wait_for_timeout(500)
+        self.settle()
+        assert self.studio.display is not None
+        browser.wait_for_points(self.page, int((~self.studio.display.is_crown).sum()))
+        self.settle(1.0)
+
+    def step(self, name: str) -> None:
+        self.page.click(f"button[data-step={name}]")
+        self.settle(1.5)
+
+    def choose(self, tree_id: int) -> None:
+        self.page.click(f"tr[data-id='{tree_id}']")
+        self.settle()
+
+    def show_path(self, text: str) -> None:
+        """A path as a reader would type it, in place of the one on this computer."""
+        field = "//label[normalize-space()='File or folder']/ancestor::div[contains(@class,'mantine-Flex-root')][1]"
+        self.page.locator(f"{field}//input").first.fill(text)
+
+
+def smallest(image: Image.Image) -> bytes:
+    """PNG with as many colours as fit: points need few, the panel keeps its own, and what means something its hue."""
+    panel = image.crop((int(0.73 * image.width), 0, image.width, image.height))
+    own = panel.quantize(64, dither=Image.Dither.NONE).getpalette()[: 3 * 64]
+    for colours in (128, 96, 64, 40, 24):
+        scene = image.quantize(colours, dither=Image.Dither.NONE).getpalette()[: 3 * colours]
+        palette = Image.new("P", (1, 1))
+        palette.putpalette([*np.ravel(KEPT).tolist(), *own, *scene])
+        content = io.BytesIO()
+        image.quantize(palette=palette, dither=Image.Dither.NONE).save(content, "PNG", optimize=True)
+        if content.tell() <= LARGEST_BYTES:
+            return content.getvalue()
+    raise SystemExit(f"A picture stays above {LARGEST_BYTES} bytes.")
+
+
+def unscaled(demo: Path, folder: Path) -> Path:
+    """The demo plot as photogrammetry would leave it: no unit, y up."""
+    cloud = read_reconstruction(demo).cloud
+    xyz = (cloud.xyz[::4] / 1.7)[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32)
+    path = folder / "from_video.ply"
+    write_ply(path, PointCloud(xyz.astype(np.float32), np.zeros(3), None if cloud.rgb is None else cloud.rgb[::4]))
+    return path
+
+
+def tour(camera: Photographer, folder: Path) -> None:
+    """The way of one plot from opening to export, as the guide tells it."""
+    page, studio = camera.page, camera.studio
+    demo = folder / "demo_plot.laz"
+    shutil.copyfile(demo_plot().path, demo)
+    if not camera.wanted or "scale" in camera.wanted or "data-check-unscaled" in camera.wanted:
+        camera.open(unscaled(demo, folder))
+        camera.take("scale")
+        camera.step("open")
+        camera.show_path("plots/from_video.ply")
+        camera.take("data-check-unscaled", clip=PANEL)
+    camera.open(demo)
+    camera.step("open")
+    camera.show_path("plots/demo_plot.laz")
+    camera.take("open")
+    camera.step("trunks")
+    page.get_by_role("button", name="Find trunks", exact=True).click()
+    page.wait_for_function("() => parseFloat(document.querySelector('.dbh-bar div')?.style.width) > 30")
+    camera.take("finding")
+    camera.settle(5.0)
+    camera.take("trunks")
+    assert studio.session is not None
+    results = {i: studio.session.measurement(i).result for i in studio.session.document.trunks.ids}
+    good = [i for i, r in results.items() if isinstance(r, DbhEstimate) and r.quality == "good"]
+    partly = [i for i, r in results.items() if isinstance(r, DbhEstimate) and r.quality == "poor"]
+    refused = [i for i, r in results.items() if not r]
+    camera.choose(good[len(good) // 2])
+    camera.take("inspect")
+    camera.take("card", clip=".dbh-card")
+    if partly:
+        camera.choose(partly[0])
+        camera.take("poor")
+    if refused:
+        camera.choose(refused[0])
+        camera.take("refused")
+    page.click("#dbh-view button[data-look=plot]")
+    page.click("#dbh-view button[data-mode='Segmentation (by tree)']")
+    camera.step("export")
+    camera.take("export")
+
+
+@contextlib.contextmanager
+def photographer(folder: Path, out: Path, wanted: list[str], display_points: int) -> Iterator[Photographer]:
+    chromium_path = find_chromium()
+    if chromium_path is None:
+        raise SystemExit("No Chromium was found; 'make test' installs it, or says how.")
+    studio = Studio(start_server(port=0), uploads_folder=folder / "uploads", display_points=display_points)
+    try:
+        with browser.chromium(chromium_path) as chromium:
+            page = browser.open_page(chromium, studio.server.url + "&fixedDpr=1", size=SIZE)
+            page.wait_for_selector(".dbh-steps")
+            camera = Photographer(studio, page, out, wanted)
+            camera.settle()
+            yield camera
+            errors = browser.page_errors(page)
+            if errors:
+                raise SystemExit("\n".join(["The page complained:", *errors]))
+    finally:
+        studio.close()
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description="Make the pictures of the guide.")
+    parser.add_argument("names", nargs="*", help="which pictures; all by default")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "guide" / "pictures")
+    parser.add_argument("--display-points", type=int, default=700_000)
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with photographer(folder, options.out, options.names, options.display_points) as camera:
+            tour(camera, folder)
+
+
+if __name__ == "__main__":
+    main()
