@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 from scipy.special import ellipe
 
 from dbh_studio.core.curves import CURVES, BSpline, Ellipse, Fourier
@@ -53,6 +54,28 @@ def test_ellipse_turned_and_moved():
     assert area == pytest.approx(np.pi * 0.6, rel=1e-4)
     assert girth == pytest.approx(perimeter, rel=1e-9)
     np.testing.assert_allclose(outline_centroid(outline), [0.3, -0.2], atol=1e-9)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("dents", [0.0, 0.02, 0.3])
+def test_the_girth_is_that_of_the_convex_hull(dents, reverse):
+    t = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    radius = 1.0 + dents * np.cos(5 * t)  # convex, hardly dented, a star
+    outline = np.stack([radius * np.cos(t), radius * np.sin(t)], axis=1)[:: -1 if reverse else 1]
+    perimeter, area, girth = outline_metrics(outline)
+    hull = ConvexHull(outline)
+    assert girth == pytest.approx(hull.area, rel=1e-12)
+    is_convex = area == pytest.approx(hull.volume, rel=1e-9)
+    assert is_convex == (dents < 0.3)
+    assert (girth == pytest.approx(perimeter, rel=1e-9)) == is_convex
+
+
+def test_the_girth_of_a_walk_that_turns_twice_is_not_its_length():
+    """A loop gone round twice turns one way all along, and a tape goes round once."""
+    t = np.linspace(0, 4 * np.pi, 720, endpoint=False)
+    perimeter, _, girth = outline_metrics(np.stack([np.cos(t), np.sin(t)], axis=1))
+    assert perimeter == pytest.approx(4 * np.pi, rel=1e-3)
+    assert girth == pytest.approx(2 * np.pi, rel=1e-3)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])

@@ -7,7 +7,7 @@ import pytest
 
 from dbh_studio.core.curves import CURVES, Fourier
 from dbh_studio.core.curves.base import outline_metrics
-from dbh_studio.core.robust import canonical_order, ransac, robust_circle
+from dbh_studio.core.robust import canonical_order, ransac, robust_circle, tukey_sigma
 
 
 def noisy_ring(n=600, radius=1.0, noise=0.01, arc_deg=360.0, centre=(0.0, 0.0), seed=0):
@@ -146,3 +146,9 @@ class TestRobustCircle:
     def test_larger_than_allowed_is_none_or_smaller(self):
         circle = robust_circle(noisy_ring(500, 0.8), tolerance_m=0.05, max_radius_m=0.3, rng=np.random.default_rng(0))
         assert circle is None or circle.radius_m < 0.3
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 501])
+def test_the_robust_deviation_is_by_the_median(n):
+    error = np.random.default_rng(n).normal(size=n)
+    assert tukey_sigma(error) == 1.4826 * float(np.median(np.abs(error)))
