@@ -267,17 +267,18 @@ def _implausible(fit: CurveFit, section: CrossSection, settings: MeasureSettings
     """A refusal where a curve cannot be the stem's outline: it misses the ring, or contradicts it."""
     diameter_cm = 100.0 * fit.diameter_m(settings.definition)
     ring_cm = 200.0 * section.ring_radius_m
+    if not contains(fit.outline_uv_m, np.zeros(2)):
+        return Refusal("implausible", f"The {fit.curve} curve does not go round the ring's centre.", _LOOK, section)
+    if not 1.0 / _WORST_RATIO < diameter_cm / ring_cm < _WORST_RATIO:
+        reason = f"The {fit.curve} curve gives {diameter_cm:.1f} cm where a circle gives {ring_cm:.1f} cm."
+        return Refusal("implausible", reason, _LOOK, section)
+    # Last: only where curve and ring agree does an odd size speak of the scale.
     if not settings.min_diameter_cm <= diameter_cm <= settings.max_diameter_cm:
         limits = f"{settings.min_diameter_cm:g} to {settings.max_diameter_cm:g} cm"
         reason = f"The {fit.curve} curve gives {diameter_cm:.1f} cm, outside {limits}."
         return Refusal(
             "implausible", reason, "Check the scale of the cloud; if it is right, change the limits.", section
         )
-    if not contains(fit.outline_uv_m, np.zeros(2)):
-        return Refusal("implausible", f"The {fit.curve} curve does not go round the ring's centre.", _LOOK, section)
-    if not 1.0 / _WORST_RATIO < diameter_cm / ring_cm < _WORST_RATIO:
-        reason = f"The {fit.curve} curve gives {diameter_cm:.1f} cm where a circle gives {ring_cm:.1f} cm."
-        return Refusal("implausible", reason, _LOOK, section)
     return None
 
 
