@@ -15,7 +15,8 @@ TRUNK_RED = (214, 40, 40)
 HIGHLIGHT_YELLOW = (255, 208, 0)
 
 _FIRST_CHUNK = 60_000
-_LARGEST_CHUNK = 500_000
+# A click waits in the page until the chunk at hand is in the graphics memory.
+_LARGEST_CHUNK = 200_000
 
 _N_SHADES = 1024
 

@@ -17,8 +17,7 @@ from dbh_studio.core.transforms import UP_AXES, rotation_to_z_up
 _SAMPLE = 60_000
 _NEIGHBOURS = 24
 _NORMALS = 30_000
-# To tell six axes apart takes fewer than the last degree of any direction does, unless hardly a place is planar.
-_NORMALS_FOR_AXES = 10_000
+# To tell six axes apart takes fewer than the last degree of any direction does.
 _PLANAR_FOR_AXES = 700
 # Two threads are there on any machine; the result does not depend on them.
 _N_WORKERS = min(4, os.cpu_count() or 1)
@@ -103,9 +102,7 @@ def estimate_up(points: NDArray[Any], *, axes_only: bool = False, prior: str | N
     unsure = UpDirection(axis_vector(default), default, 0.0, 0.0, False)
     if len(sample) < 200:
         return unsure
-    normals, where = _normals(sample, _NORMALS_FOR_AXES if axes_only else _NORMALS)
-    if axes_only and len(normals) < _PLANAR_FOR_AXES:
-        normals, where = _normals(sample, _NORMALS)
+    normals, where = _normals(sample, _PLANAR_FOR_AXES if axes_only else None)
     if len(normals) < 100:
         return unsure
     lines = np.eye(3) if axes_only else np.concatenate([np.eye(3), _hemisphere(1500)])
@@ -140,23 +137,38 @@ def _hemisphere(n: int) -> Float64:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _normals(sample: Float64, n_most: int) -> tuple[Float64, Float64]:
-    """(M, 3) normals of planar neighbourhoods, one per voxel so that dense places do not outvote, and (M, 3) where."""
+def _normals(sample: Float64, n_enough: int | None) -> tuple[Float64, Float64]:
+    """(M, 3) normals of planar neighbourhoods, one per voxel so that dense places do not outvote, and (M, 3) where.
+
+    With `n_enough`, a third of the places is looked at first, and the others only where fewer than that are planar.
+    """
     extent = np.ptp(sample, axis=0)
     step = float(np.sqrt(np.sort(extent)[1:].prod()) / 150.0) or 1.0
     voxels = np.floor((sample - sample.min(axis=0)) / step).astype(np.int64)
     keys = (voxels[:, 0] * 1_000_003 + voxels[:, 1]) * 1_000_003 + voxels[:, 2]
     _, first = np.unique(keys, return_index=True)
     # Thinned over the whole list, which is in order of place.
-    queries = sample[first[:: max(1, len(first) // n_most)]]
-    # A trunk seen in a sparse sample is thinner than its neighbourhood of k points, so the radius is bounded too.
+    places = sample[first[:: max(1, len(first) // _NORMALS)]]
     tree = cKDTree(sample, balanced_tree=False, compact_nodes=False)
-    _, neighbours = tree.query(queries, k=_NEIGHBOURS, workers=_N_WORKERS)
+    if n_enough is None:
+        return _planar_normals(tree, sample, places)
+    normals, where = _planar_normals(tree, sample, places[::3])
+    if len(normals) >= n_enough:
+        return normals, where
+    others = np.delete(places, slice(None, None, 3), axis=0)
+    more, more_where = _planar_normals(tree, sample, others)
+    return np.concatenate([normals, more]), np.concatenate([where, more_where])
+
+
+def _planar_normals(tree: cKDTree, sample: Float64, places: Float64) -> tuple[Float64, Float64]:
+    """(M, 3) normals of those neighbourhoods of (N, 3) places that are planar, and (M, 3) where."""
+    # A trunk seen in a sparse sample is thinner than its neighbourhood of k points, so the radius is bounded too.
+    _, neighbours = tree.query(places, k=_NEIGHBOURS, workers=_N_WORKERS)
     local = sample[neighbours]
     local = local - local.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(local.transpose(0, 2, 1) @ local)
     planar = (values[:, 0] < 0.08 * values[:, 1]) & (values[:, 1] > 0.05 * values[:, 2])
-    return vectors[planar, :, 0], queries[planar]
+    return vectors[planar, :, 0], places[planar]
 
 
 def _scores(normals: Float64, lines: Float64) -> Float64:
