@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 from dbh_studio.ui.steps import StepName
@@ -10,7 +11,7 @@ if TYPE_CHECKING:
     from dbh_studio.ui.tab import Tab
 
 
-class Panel:
+class Panel(ABC):
     """One step of the work. Subclasses add their inputs in `build` and show the plot in `refresh`."""
 
     step: StepName
@@ -22,14 +23,15 @@ class Panel:
         with self.folder:
             self.build()
 
+    @abstractmethod
     def build(self) -> None:
         """Add the panel's inputs at the GUI's current place."""
-        raise NotImplementedError
 
+    @abstractmethod
     def refresh(self) -> None:
         """Show the plot as it is now; cheap where nothing changed."""
 
-    def set_busy(self, busy: bool) -> None:
+    def set_busy(self, busy: bool) -> None:  # noqa: B027 - most panels start nothing
         """Lock what cannot be started while a job runs."""
 
     def show(self, visible: bool) -> None:
