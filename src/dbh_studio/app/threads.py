@@ -1,8 +1,8 @@
 """The same work on many values, on two threads.
 
-Threads, not processes: they start at once, share the cloud, and end with whatever ends the process they are in. Most
-of the work on a stem runs in numpy and scipy without Python's lock, so two threads take about two thirds of the time of
-one; a third gains nothing.
+Threads, not processes: they start at once, share the cloud, and end with whatever ends the process they are in. Much
+of the work on a stem runs in numpy and scipy without Python's lock: two threads take about three quarters of the time
+of one. More would mostly wait for that lock.
 """
 
 from __future__ import annotations
