@@ -13,17 +13,17 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Literal
 
-from dbh_studio.app.document import Document, SourceInfo
+from dbh_studio.app.document import CameraSource, Document, SourceInfo
 from dbh_studio.app.session import Change, Session
 from dbh_studio.errors import ProjectError
-from dbh_studio.io.project import PlotState, ProjectWriter
+from dbh_studio.io.project import CameraPlace, PlotState, ProjectWriter
 
 _log = logging.getLogger(__name__)
 
 
 def state_from_document(document: Document) -> PlotState:
     """What is saved of a Document: all of it."""
-    source = document.source
+    source, cameras = document.source, document.cameras
     return PlotState(
         plot_id=document.plot_id,
         source_path=source.path,
@@ -35,12 +35,29 @@ def state_from_document(document: Document) -> PlotState:
         settings=document.settings,
         trunks=document.trunks,
         trees=document.trees,
+        north_direction=document.north_direction,
+        origin_src=document.origin_src,
+        evidence=document.evidence,
+        cameras=None if cameras is None else CameraPlace(cameras.path, cameras.images_dir, cameras.frame),
     )
 
 
 def document_from_state(state: PlotState, source: SourceInfo) -> Document:
     """The Document that was saved, about `source`, which the caller has found to be the same cloud."""
-    return Document(state.plot_id, source, state.up_direction, state.scale, state.settings, state.trunks, state.trees)
+    cameras = state.cameras
+    return Document(
+        plot_id=state.plot_id,
+        source=source,
+        up_direction=state.up_direction,
+        scale=state.scale,
+        settings=state.settings,
+        trunks=state.trunks,
+        trees=state.trees,
+        north_direction=state.north_direction,
+        origin_src=state.origin_src,
+        evidence=state.evidence,
+        cameras=None if cameras is None else CameraSource(cameras.path, cameras.images_dir, cameras.frame),
+    )
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.app.document import Direction, Document, unit_direction
+from dbh_studio.app.document import CameraSource, Direction, Document, unit_direction
 from dbh_studio.core.arrays import Int32
 from dbh_studio.core.inventory import TreeRecord, check_text
 from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.scale_evidence import MarkerSquare, ScaleBar, ScaleEvidence
 from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
 from dbh_studio.errors import CommandError, SettingError
 
 # A detection that shares more than this part of its points with an old trunk is that trunk, found again. Above one half
 # at most one old trunk can qualify.
 _SAME_TRUNK_IOU = 0.5
+# Of a known length, metres.
+_SHORTEST_M, _LONGEST_M = 0.001, 10_000.0
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,99 @@ def set_up(direction: str | Direction | NDArray[Any]) -> Command:
         return document if up == document.up_direction else replace(document, up_direction=up)
 
     return Command("Change the up direction", apply)
+
+
+def set_evidence(evidence: ScaleEvidence, *, label: str, scale: ScaleEstimate | None = None) -> Command:
+    """Keep other known lengths, and with `scale` take the scale from them in the same step."""
+
+    def apply(document: Document) -> Document:
+        after = document if evidence == document.evidence else replace(document, evidence=evidence)
+        return after if scale is None or scale == after.scale else replace(after, scale=scale)
+
+    return Command(label, apply)
+
+
+def add_length(length: ScaleBar | MarkerSquare) -> Command:
+    """Mark a known length, or put it in place of the one of the same name."""
+
+    def apply(document: Document) -> Document:
+        _check_length(length)
+        return replace(document, evidence=document.evidence.with_length(length))
+
+    return Command(f"Mark {length.name}", apply)
+
+
+def change_length(name: str, **values: Any) -> Command:
+    """Say another `length_m`, `side_m`, `role`, `name` or other field of a known length."""
+
+    def apply(document: Document) -> Document:
+        before = _known_length(document, name)
+        try:
+            after = replace(before, **values)
+        except (TypeError, ValueError) as error:
+            raise CommandError(f"This cannot be said about {name}: {error}.") from None
+        if after == before:
+            return document
+        _check_length(after)
+        if after.name != name and after.name in document.evidence:
+            raise CommandError(f"There is a {after.name} already.", "Choose another name.")
+        return replace(document, evidence=document.evidence.with_changed(name, after))
+
+    return Command(f"Change {name}", apply)
+
+
+def remove_length(name: str) -> Command:
+    """Forget a known length. A scale taken from it stays until another is set."""
+
+    def apply(document: Document) -> Document:
+        _known_length(document, name)
+        return replace(document, evidence=document.evidence.without(name))
+
+    return Command(f"Remove {name}", apply)
+
+
+def set_cameras(cameras: CameraSource | None) -> Command:
+    """Say where the photos and their poses are."""
+
+    def apply(document: Document) -> Document:
+        return document if cameras == document.cameras else replace(document, cameras=cameras)
+
+    return Command("Forget the photos" if cameras is None else f"Add the photos of {cameras.path.name}", apply)
+
+
+def set_frame(
+    *,
+    up: str | Direction | NDArray[Any] | None = None,
+    north: Direction | NDArray[Any] | None = None,
+    origin_src: Direction | NDArray[Any] | None = None,
+) -> Command:
+    """Say where the sky, north and the plot's origin are, in one step; what is None stays as it is.
+
+    Args:
+        up: A named axis or any direction in the source.
+        north: A direction in the source; its level part becomes +y.
+        origin_src: Source units from the cloud's origin.
+    """
+
+    def apply(document: Document) -> Document:
+        values: dict[str, Any] = {}
+        try:
+            if up is not None:
+                values["up_direction"] = unit_direction(up)
+            if north is not None:
+                values["north_direction"] = unit_direction(north)
+        except ValueError as error:
+            raise CommandError(f"The direction was not understood: {error}.") from None
+        if origin_src is not None:
+            origin = np.asarray(origin_src, np.float64)
+            if origin.shape != (3,) or not np.isfinite(origin).all():
+                raise CommandError("The origin of the plot is nowhere.")
+            values["origin_src"] = tuple(origin.tolist())
+        after = replace(document, **values)
+        same = all(getattr(document, name) == value for name, value in values.items())
+        return document if same else after
+
+    return Command("Set the plot's origin and directions", apply)
 
 
 def change_settings(section: str, **values: Any) -> Command:
@@ -160,6 +256,33 @@ def set_tree_record(trunk_id: int, **values: Any) -> Command:
         return replace(document, trees=trees)
 
     return Command(f"Describe trunk {trunk_id}", apply)
+
+
+def _known_length(document: Document, name: str) -> ScaleBar | MarkerSquare:
+    if name not in document.evidence:
+        raise CommandError(f"There is no known length {name}.")
+    return document.evidence[name]
+
+
+def _check_length(length: ScaleBar | MarkerSquare) -> None:
+    """Raise CommandError where its name or numbers make no sense."""
+    try:
+        check_text("the name", length.name)
+    except ValueError as error:
+        raise CommandError(f"The length cannot be called this: {error}.") from None
+    if not length.name.strip():
+        raise CommandError("A known length needs a name.", "Type at least one letter or digit.")
+    true_m = length.length_m
+    if not (np.isfinite(true_m) and _SHORTEST_M <= true_m <= _LONGEST_M):
+        raise CommandError(
+            f"{length.name} cannot be {true_m:g} m long.",
+            f"Give its true length in metres, {_SHORTEST_M:g} to {_LONGEST_M:,.0f}.",
+        )
+    if not 0.0 <= length.length_se_m < true_m:
+        raise CommandError(
+            f"The error of {length.name} cannot be {length.length_se_m:g} m.",
+            "Give 0 or more, and less than it is long.",
+        )
 
 
 def _existing(document: Document, trunk_id: int) -> Trunk:

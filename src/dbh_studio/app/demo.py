@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import datetime
 import hashlib
@@ -10,21 +11,26 @@ import json
 import os
 import shutil
 import tempfile
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from platformdirs import user_cache_dir
 
+from dbh_studio.app.cache import CACHE_VARIABLE, cache_folder
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.synthetic import GENERATOR_VERSION, PlotRecipe, TreeTruth, make_plot
-from dbh_studio.errors import FileError, MalformedFileError, MissingComponentError, SettingError
+from dbh_studio.errors import FileError, MalformedFileError, MissingComponentError, ProjectLockedError, SettingError
+from dbh_studio.io.lock import lock_file
 
-CACHE_VARIABLE = "DBH_STUDIO_CACHE"
 _PLOT_NAME, _TRUTH_NAME, _MANIFEST_NAME = "demo_plot_synthetic.laz", "demo_plot_truth.csv", "complete.json"
 # Half a millimetre: well below the noise, and a quarter smaller than a tenth of one.
 _LAZ_STEP_M = 0.0005
+_WORKSHOP, _LOCK = ".demo-", ".lock"
+# Younger than this a lock nobody holds may be one that is just being taken; a workshop without one is a day's leftover.
+_SETTLED_S, _ABANDONED_S = 60.0, 86_400.0
 _NOTE = "Synthetic forest plot made by DBH Studio; no such forest exists. Metres, z up, no coordinate reference system."
 
 
@@ -39,14 +45,6 @@ class DemoPlot:
 
     path: Path
     truth_csv: Path
-
-
-def cache_folder(cache_dir: Path | None = None) -> Path:
-    """The given folder, else the one named by the environment variable DBH_STUDIO_CACHE, else the user's cache."""
-    if cache_dir is not None:
-        return Path(cache_dir)
-    named = os.environ.get(CACHE_VARIABLE)
-    return Path(named) if named else Path(user_cache_dir("dbh-studio", appauthor=False))
 
 
 def demo_recipe() -> PlotRecipe:
@@ -115,8 +113,8 @@ def _is_complete(folder: Path) -> bool:
 def _make(folder: Path, recipe: PlotRecipe, progress: Progress) -> None:
     """Make the plot in a folder of its own and move that into place as a whole."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    workshop = Path(tempfile.mkdtemp(prefix=".demo-", dir=folder.parent))
-    try:
+    _clear_leftovers(folder.parent)
+    with _workshop(folder.parent) as workshop:
         plot = make_plot(recipe, progress=subprogress(progress, 0.0, 0.8))
         progress(0.8, "Saving the demo plot.")
         write_laz(workshop / _PLOT_NAME, plot.cloud)
@@ -126,8 +124,34 @@ def _make(folder: Path, recipe: PlotRecipe, progress: Progress) -> None:
         # A temporary folder is its maker's alone; the cache may be shared.
         workshop.chmod(0o755)
         _move_into_place(workshop, folder)
+
+
+@contextlib.contextmanager
+def _workshop(cache: Path) -> Iterator[Path]:
+    """A folder to work in, gone afterwards; the system's lock on the file beside it says that its maker is alive."""
+    workshop = Path(tempfile.mkdtemp(prefix=_WORKSHOP, dir=cache))
+    lock_path = Path(f"{workshop}{_LOCK}")
+    try:
+        with contextlib.ExitStack() as held:
+            with contextlib.suppress(OSError):  # a file system without locks: nobody will clear up, nobody is harmed
+                held.enter_context(lock_file(lock_path))
+            yield workshop
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
+        lock_path.unlink(missing_ok=True)
+
+
+def _clear_leftovers(cache: Path) -> None:
+    """Remove the workshops of processes that were killed, and no others."""
+    for path in cache.glob(f"{_WORKSHOP}*"):
+        with contextlib.suppress(OSError, ProjectLockedError):
+            age_s = time.time() - path.stat().st_mtime
+            if path.suffix == _LOCK and age_s > _SETTLED_S:
+                lock_file(path).close()  # raises where its maker lives
+                shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+                path.unlink(missing_ok=True)
+            elif path.is_dir() and age_s > _ABANDONED_S and not Path(f"{path}{_LOCK}").exists():
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def _move_into_place(workshop: Path, folder: Path) -> None:

@@ -79,7 +79,8 @@ def transformed(cloud: PointCloud, world_from_source: Similarity) -> Float32:
 
 def _frame_key(document: Document) -> Hashable:
     scale = document.scale
-    return document.up_direction, scale.metres_per_unit if scale.is_known else 1.0
+    metres_per_unit = scale.metres_per_unit if scale.is_known else 1.0
+    return document.up_direction, document.north_direction, document.origin_src, metres_per_unit
 
 
 def _ground_key(document: Document) -> Hashable:

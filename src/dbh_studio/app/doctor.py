@@ -1,8 +1,8 @@
 """What is present, what is missing, what each missing part costs, and the line that mends it.
 
 Only the standard library is imported here, so that this works where everything else is missing. Each package is
-imported in a process of its own: one whose system library is absent, or which crashes, is reported and does not end
-the doctor.
+imported in another process, all in one to be quick: one whose system library is absent, or which crashes, is tried
+again in a process of its own, reported, and does not end the doctor.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from dbh_studio.app.cache import cache_folder
 from dbh_studio.app.components import APT_PACKAGES, COMPONENTS, Component, no_wheel_reason
 
 Status = Literal["ok", "missing", "broken"]
@@ -36,6 +37,8 @@ MIN_CORES = 2
 MIN_MEMORY_GB = 4.0
 MIN_DISK_GB = 2.0
 IMPORT_TIMEOUT_S = 120.0
+# After this long, something hangs or the disk is slow: then each is given its own time.
+TOGETHER_TIMEOUT_S = 40.0
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM_MAC = "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome"
 FONT_FOLDERS = ("/usr/share/fonts", "/usr/local/share/fonts", "~/.local/share/fonts", "~/.fonts", "/Library/Fonts")
@@ -55,6 +58,18 @@ except BaseException as error:
         except OSError:
             answer["libraries"].append(name)
 print("\\n" + json.dumps(answer))
+"""
+
+# Run by `python -c`: names what can be imported. Ends at once, for taking down what was loaded takes as long again.
+TOGETHER = """
+import importlib, os, sys
+for name in sys.argv[1:]:
+    try:
+        importlib.import_module(name)
+    except BaseException:
+        continue
+    print("\\nimported " + name, flush=True)
+os._exit(0)
 """
 
 
@@ -86,15 +101,18 @@ class Check:
 
 
 def check_all(*, port: int = STUDIO_PORT) -> tuple[Check, ...]:
-    """Every check; takes a few seconds, most of it importing Open3D.
+    """Every check; takes a second or two, most of it importing Open3D and trimesh.
 
     Args:
         port: The port that the studio would listen on.
     """
-    with ThreadPoolExecutor(max_workers=min(4, os.cpu_count() or 1)) as pool:
-        components = tuple(pool.map(check_component, COMPONENTS))
+    modules = [component.module for component in COMPONENTS if _is_found(component)]
+    with ThreadPoolExecutor(max_workers=min(4, (os.cpu_count() or 1) + 1)) as pool:
+        test_parts = pool.submit(check_test_parts)
+        imported = import_together(modules)
+        components = tuple(pool.map(lambda item: check_component(item, imported=imported), COMPONENTS))
     machine = (check_python(), check_cores(), check_memory(), check_disk(), check_port(port))
-    return (*machine, *components, *check_test_parts())
+    return (*machine, *components, *test_parts.result())
 
 
 def is_usable(checks: Iterable[Check]) -> bool:
@@ -143,12 +161,19 @@ def _verdict(checks: Iterable[Check]) -> str:
     return f"{text} Its own browser tests lack {', '.join(tests)}." if tests else text
 
 
-def check_component(component: Component) -> Check:
-    """Import a package in a process of its own and say what is wrong with it, if anything."""
+def check_component(component: Component, *, imported: Collection[str] = ()) -> Check:
+    """Import a package in a process of its own and say what is wrong with it, if anything.
+
+    Args:
+        component: The package.
+        imported: Modules known to work, which are not tried again.
+    """
     name, version = _installed(component)
-    if importlib.util.find_spec(component.module) is None:
+    if not _is_found(component):
         remedy = no_wheel_reason(component) or pip_line(name)
         return Check(name, "missing", "", component.cost, remedy, component.required)
+    if component.module in imported:
+        return Check(name, "ok", version, component.cost, "", component.required)
     error, absent_module, libraries = probe(component.module, component.libraries)
     if not error:
         return Check(name, "ok", version, component.cost, "", component.required)
@@ -161,6 +186,28 @@ def check_component(component: Component) -> Check:
     else:
         remedy = pip_line(name, reinstall=True)
     return Check(name, "broken", version, component.cost, remedy, component.required, error, apt)
+
+
+def _is_found(component: Component) -> bool:
+    return importlib.util.find_spec(component.module) is not None
+
+
+def import_together(modules: Sequence[str]) -> set[str]:
+    """Those of the modules that one new process can import; what is not among them may be blameless."""
+    if not modules:
+        return set()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", TOGETHER, *modules],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=TOGETHER_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return set()
+    return {line.removeprefix("imported ") for line in done.stdout.splitlines() if line.startswith("imported ")}
 
 
 def probe(module: str, libraries: Sequence[str] = ()) -> tuple[str, str, tuple[str, ...]]:
@@ -281,19 +328,11 @@ def _memory_gb() -> float | None:
         return None
 
 
-def cache_folder() -> Path:
-    """Where the studio keeps what it can make again; the folder may not exist yet."""
-    try:
-        from platformdirs import user_cache_path
-    except ImportError:
-        return Path.home() / ".cache" / "dbh-studio"
-    return user_cache_path("dbh-studio", appauthor=False)
-
-
 def check_disk(folder: Path | None = None) -> Check:
     """Free space, and the right to write, where the cache is or would be."""
-    wanted = folder if folder is not None else cache_folder()
-    existing = next(path for path in (wanted, *wanted.parents) if path.exists())
+    wanted = cache_folder(folder)
+    # os.path, for pathlib raises where a folder above may not be looked into.
+    existing = next(path for path in (wanted, *wanted.parents) if os.path.exists(path))  # noqa: PTH110
     cost = "The demo plot and prepared clouds cannot be kept."
     free_gb = shutil.disk_usage(existing).free / 1e9
     if not existing.is_dir() or not os.access(existing, os.W_OK):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,13 +15,25 @@ from dbh_studio.core.arrays import Float64
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import TREE_STATUSES, TreeRecord, TreeStatus
 from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.scale_evidence import ScaleEvidence
 from dbh_studio.core.transforms import UP_AXES, Similarity, rotation_to_z_up
 from dbh_studio.core.trunks import TrunkSet
 from dbh_studio.settings import Settings
 
-__all__ = ["TREE_STATUSES", "Direction", "Document", "SourceInfo", "TreeRecord", "TreeStatus", "fingerprint"]
+__all__ = [
+    "TREE_STATUSES",
+    "CameraFrame",
+    "CameraSource",
+    "Direction",
+    "Document",
+    "SourceInfo",
+    "TreeRecord",
+    "TreeStatus",
+    "fingerprint",
+]
 
 Direction = tuple[float, float, float]
+CameraFrame = Literal["cloud", "file"]
 
 _HASH_CHUNK = 4_000_000
 
@@ -94,6 +106,35 @@ def rotation_to_world(up: Direction) -> Float64:
     return rotation_from_up(np.array(up))
 
 
+def _heading(north: Float64) -> Float64:
+    """(3, 3) rotation about z that turns the level part of `north` into +y; none where `north` stands upright."""
+    length = float(np.hypot(north[0], north[1]))
+    if length < 1e-6:
+        return np.eye(3)
+    sine, cosine = north[0] / length, north[1] / length
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class CameraSource:
+    """Where the photos of a plot and their poses are.
+
+    Attributes:
+        path: The reconstruction: a file or a folder.
+        images_dir: Where the photos are; None beside the reconstruction.
+        frame: How the poses come to the cloud: they are in its frame, or the file's own transform brings them there.
+    """
+
+    path: Path
+    images_dir: Path | None = None
+    frame: CameraFrame = "cloud"
+
+    @classmethod
+    def of(cls, path: Path | str, images_dir: Path | str | None = None, frame: CameraFrame = "cloud") -> CameraSource:
+        """With absolute paths."""
+        return cls(Path(path).absolute(), None if images_dir is None else Path(images_dir).absolute(), frame)
+
+
 @dataclass(frozen=True, eq=False)
 class Document:
     """One state of a plot. Immutable: a command makes a new one, which shares whatever did not change.
@@ -106,6 +147,10 @@ class Document:
         settings: Of the ground, the trunks and the measurement.
         trunks: Indices into the cloud, so that a new scale, up direction or ground leaves them as they are.
         trees: What the person said about stems, by trunk id; stems nobody spoke of are not in it.
+        north_direction: Direction in the source whose level part becomes +y; None leaves the source's own heading.
+        origin_src: Where the world's origin is, source units from the cloud's origin.
+        evidence: The known lengths the scale was, or may be, taken from.
+        cameras: The photos; None where there are none.
     """
 
     plot_id: str
@@ -115,9 +160,15 @@ class Document:
     settings: Settings = Settings()
     trunks: TrunkSet = TrunkSet()
     trees: Mapping[int, TreeRecord] = field(default_factory=dict)
+    north_direction: Direction | None = None
+    origin_src: Direction = (0.0, 0.0, 0.0)
+    evidence: ScaleEvidence = ScaleEvidence()
+    cameras: CameraSource | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "up_direction", unit_direction(self.up_direction))
+        if self.north_direction is not None:
+            object.__setattr__(self, "north_direction", unit_direction(self.north_direction))
         # Kept as it is where it is one already: a listener sees by identity what a command left alone.
         if not isinstance(self.trees, MappingProxyType):
             object.__setattr__(self, "trees", MappingProxyType(dict(self.trees)))
@@ -126,18 +177,32 @@ class Document:
             raise ValueError(f"trees {strangers} have a record but no trunk")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        trees = dict(self.trees)
-        fields = (self.plot_id, self.source, self.up_direction, self.scale, self.settings, self.trunks, trees)
-        return type(self), fields
+        # A mapping proxy cannot be pickled.
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return type(self), tuple((values | {"trees": dict(self.trees)}).values())
 
     @property
     def world_from_source(self) -> Similarity:
         """From `cloud.xyz` (source units, about the cloud's origin) to metres with z up.
 
-        The world's origin is the cloud's. While the scale is unknown one source unit counts as one metre, for display.
+        The world's origin is the cloud's unless somebody put it elsewhere. While the scale is unknown one source unit
+        counts as one metre, for display.
         """
         scale = self.scale.metres_per_unit if self.scale.is_known else 1.0
-        return Similarity(rotation_to_world(self.up_direction), np.zeros(3), scale)
+        rotation = rotation_to_world(self.up_direction)
+        if self.north_direction is not None:
+            rotation = _heading(rotation @ np.array(self.north_direction)) @ rotation
+        return Similarity(rotation, -scale * (rotation @ np.array(self.origin_src)), scale)
+
+    def has_frame_of(self, other: Document) -> bool:
+        """Whether the cloud lies in the world as it does for `other`."""
+        return self is other or (
+            self.scale.is_known == other.scale.is_known
+            and (not self.scale.is_known or self.scale.metres_per_unit == other.scale.metres_per_unit)
+            and self.up_direction == other.up_direction
+            and self.north_direction == other.north_direction
+            and self.origin_src == other.origin_src
+        )
 
     def record(self, trunk_id: int) -> TreeRecord:
         """What is said about a stem; an empty record where nothing is."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dbh_studio.app.autosave import Autosave, document_from_state
 from dbh_studio.app.commands import set_scale, set_up
 from dbh_studio.app.document import Direction, Document, SourceInfo, unit_direction
-from dbh_studio.app.session import Session
+from dbh_studio.app.session import Session, check_scale
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
 from dbh_studio.core.transforms import UP_AXES
@@ -44,8 +44,6 @@ _UNITS: dict[str, tuple[float, ScaleSource]] = {
     "millimetres": (0.001, "millimetres"),
     "mm": (0.001, "millimetres"),
 }
-# From micrometres to a reconstruction whose unit is ten kilometres: beyond it somebody slipped on the keyboard.
-_LEAST_SCALE, _MOST_SCALE = 1e-6, 1e4
 
 
 def scale_from(value: float | str | ScaleEstimate | None) -> ScaleEstimate:
@@ -55,7 +53,8 @@ def scale_from(value: float | str | ScaleEstimate | None) -> ScaleEstimate:
         SettingError: It is none of these, not positive, or beyond reason.
     """
     if isinstance(value, ScaleEstimate):
-        return _reasonable(value)
+        check_scale(value, "the cloud")
+        return value
     if value is None or value == "unknown":
         return ScaleEstimate()
     if isinstance(value, str) and value.lower() in _UNITS:
@@ -68,17 +67,8 @@ def scale_from(value: float | str | ScaleEstimate | None) -> ScaleEstimate:
         raise SettingError(
             f"The scale {value!r} was not understood.", f"Give metres per unit, such as 1.332, or one of: {names}."
         ) from None
-    return _reasonable(scale)
-
-
-def _reasonable(scale: ScaleEstimate) -> ScaleEstimate:
-    """The same scale. Raises SettingError where no cloud can have it, before it overflows what is computed with it."""
-    if _LEAST_SCALE <= scale.metres_per_unit <= _MOST_SCALE:
-        return scale
-    raise SettingError(
-        f"{scale.metres_per_unit:g} metres per unit is beyond reason.",
-        f"Give {_LEAST_SCALE:g} to {_MOST_SCALE:,.0f} metres per unit, or the name of a unit such as metres.",
-    )
+    check_scale(scale, "the cloud")
+    return scale
 
 
 @dataclass(frozen=True)
@@ -215,11 +205,8 @@ def read_cloud(path: Path, *, progress: Progress = ignore_progress) -> Reconstru
 def _open_new(path: Path, wish: _Wish, read: Reader, *, read_only: bool, progress: Progress) -> Session:
     _check_name(path)
     reconstruction = read(path, progress=subprogress(progress, 0.0, 0.8))
-    if reconstruction.provenance.is_geographic and wish.scale is not None and wish.scale.is_known:
-        raise SettingError(
-            f"The coordinates of {path.name} are degrees of longitude and latitude, which no scale turns into metres.",
-            "Convert the cloud to a projected system (UTM, or the national grid) first.",
-        )
+    if wish.scale is not None:
+        check_scale(wish.scale, path.name, is_geographic=reconstruction.provenance.is_geographic)
     progress(0.8, "Looking at the data")
     check = _check(reconstruction, wish)
     document = Document(
@@ -268,6 +255,7 @@ def _session(reconstruction: Reconstruction, document: Document, check: DataChec
         mesh=reconstruction.mesh,
         notes=reconstruction.notes,
         read_only=read_only,
+        is_geographic=reconstruction.provenance.is_geographic,
     )
 
 

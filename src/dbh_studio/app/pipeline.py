@@ -50,7 +50,16 @@ __all__ = [
 
 # What a segmentation depends on; a job that ran while one of them changed is stale. Of the measurement it reads only
 # how many points are too few and the seed, which are no reason to throw away minutes of work.
-SEGMENTATION_READS = ("source", "up_direction", "scale", "settings.ground", "settings.trunks", "trunks")
+SEGMENTATION_READS = (
+    "source",
+    "up_direction",
+    "north_direction",
+    "origin_src",
+    "scale",
+    "settings.ground",
+    "settings.trunks",
+    "trunks",
+)
 
 # Bytes. File systems allow 255, and what is written beside adds a suffix and a process number.
 _LONGEST_NAME = 180

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from dbh_studio.app.commands import Command
 from dbh_studio.app.derived import UNSCALED_REASON, UNSCALED_REMEDY, Derived
 from dbh_studio.app.document import Document
@@ -16,10 +18,12 @@ from dbh_studio.core.arrays import Float32
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import Inventory
 from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.errors import CommandError, ProjectError, StaleResultError, UnscaledCloudError
+from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.errors import CommandError, ProjectError, SettingError, StaleResultError, UnscaledCloudError
 
 if TYPE_CHECKING:
     from dbh_studio.app.autosave import Autosave
+    from dbh_studio.app.cameras import Cameras
     from dbh_studio.core.datacheck import DataCheck
     from dbh_studio.core.ground import GroundModel
     from dbh_studio.stages.measure import StemMeasurement
@@ -27,6 +31,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 HISTORY_LIMIT = 200
+# From micrometres to a reconstruction whose unit is ten kilometres: beyond it somebody slipped on the keyboard.
+_LEAST_SCALE, _MOST_SCALE = 1e-6, 1e4
 
 _FIELDS = {
     "plot_id": "the name of the plot",
@@ -39,6 +45,10 @@ _FIELDS = {
     "settings.measure": "the measurement settings",
     "trunks": "the trunks",
     "trees": "what is said about the trees",
+    "north_direction": "the direction of north",
+    "origin_src": "the plot's origin",
+    "evidence": "the known lengths",
+    "cameras": "the photos",
 }
 _ALL_FIELDS = tuple(name for name in _FIELDS if "." not in name)
 
@@ -50,6 +60,13 @@ class Change:
     before: Document
     after: Document
     label: str
+
+    @property
+    def moves_points(self) -> bool:
+        """Whether points lie elsewhere in the world frame than before."""
+        before, after = self.before.world_from_source, self.after.world_from_source
+        parts = ((before.rotation, after.rotation), (before.translation, after.translation))
+        return before.scale != after.scale or not all(np.array_equal(was, now) for was, now in parts)
 
 
 Listener = Callable[[Change], None]
@@ -68,6 +85,7 @@ class Session:
         mesh: The reconstruction's mesh, for display.
         notes: What the reader of the cloud has to say, in plain words.
         read_only: Refuse every command.
+        is_geographic: The coordinates are degrees, which no scale turns into metres.
         history_limit: How many commands can be undone.
         derived: For tests.
 
@@ -84,6 +102,7 @@ class Session:
         mesh: Any = None,
         notes: Iterable[str] = (),
         read_only: bool = False,
+        is_geographic: bool = False,
         history_limit: int = HISTORY_LIMIT,
         derived: Derived | None = None,
     ) -> None:
@@ -94,9 +113,11 @@ class Session:
         self.mesh = mesh
         self.notes = tuple(notes)
         self.is_read_only = read_only
+        self._is_geographic = is_geographic
         self.saver: Autosave | None = None
         self._document = document
         self._derived = derived or Derived(cloud)
+        self._cameras: Cameras | None = None
         self._next_id = document.trunks.next_id
         self._past: deque[tuple[str, Document]] = deque(maxlen=history_limit)
         self._future: list[tuple[str, Document]] = []
@@ -152,6 +173,7 @@ class Session:
 
         Raises:
             CommandError: It cannot be applied; nothing has changed.
+            SettingError: It sets a scale that the cloud cannot have; nothing has changed.
             StaleResultError: A field of `reads` is no longer what it was; nothing has changed, other edits are kept.
         """
         with self._lock:
@@ -160,6 +182,8 @@ class Session:
             if based_on is not None:
                 _check_fresh(based_on, before, tuple(reads) or _ALL_FIELDS)
             after = self._apply(command, before)
+            if after.scale != before.scale:
+                check_scale(after.scale, before.source.path.name, is_geographic=self._is_geographic)
             change = Change(before, after, command.label)
             if after is before:
                 return change
@@ -281,13 +305,17 @@ class Session:
         """Keep a ground that a job fitted for `document`."""
         self._derived.put_ground(document, ground)
 
-    def measurement(self, trunk_id: int) -> StemMeasurement:
+    def measurement(self, trunk_id: int, *, document: Document | None = None) -> StemMeasurement:
         """The diameter of one stem, or why there is none.
+
+        Args:
+            trunk_id: Which.
+            document: The state to measure in, where others may change the plot meanwhile; the present one by default.
 
         Raises:
             KeyError: There is no such trunk.
         """
-        return self._derived.measurement(self._document, trunk_id)
+        return self._derived.measurement(document or self._document, trunk_id)
 
     def measurements(self, progress: Progress = ignore_progress) -> tuple[StemMeasurement, ...]:
         """All stems, in order of id."""
@@ -305,9 +333,19 @@ class Session:
         for measurement in measurements:
             self._derived.put_measurement(document, measurement)
 
-    def inventory(self, progress: Progress = ignore_progress) -> Inventory:
-        """One row per stem."""
-        return self._derived.inventory(self._document, progress)
+    def inventory(self, progress: Progress = ignore_progress, *, document: Document | None = None) -> Inventory:
+        """One row per stem, now or in an earlier state."""
+        return self._derived.inventory(document or self._document, progress)
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """The photos the Document speaks of, where they were read already."""
+        cameras, source = self._cameras, self._document.cameras
+        return cameras if cameras is not None and cameras.source == source else None
+
+    def remember_cameras(self, cameras: Cameras) -> None:
+        """Keep photos that were read for the Document as it is, or as the next command will make it."""
+        self._cameras = cameras
 
     def require_scale(self, document: Document | None = None) -> None:
         """Raise UnscaledCloudError, which says what to do, unless lengths are in metres."""
@@ -331,6 +369,22 @@ class Session:
         saver, self.saver = self.saver, None
         if saver is not None:
             saver.close()
+
+
+def check_scale(scale: ScaleEstimate, name: str, *, is_geographic: bool = False) -> None:
+    """Raise SettingError where the cloud called `name` cannot have this scale: before it overflows what follows."""
+    if not scale.is_known:
+        return
+    if is_geographic:
+        raise SettingError(
+            f"The coordinates of {name} are degrees of longitude and latitude, which no scale turns into metres.",
+            "Convert the cloud to a projected system (UTM, or the national grid) first.",
+        )
+    if not _LEAST_SCALE <= scale.metres_per_unit <= _MOST_SCALE:
+        raise SettingError(
+            f"{scale.metres_per_unit:g} metres per unit is beyond reason.",
+            f"Give {_LEAST_SCALE:g} to {_MOST_SCALE:,.0f} metres per unit, or the name of a unit such as metres.",
+        )
 
 
 def _field(document: Document, name: str) -> Any:

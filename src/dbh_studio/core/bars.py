@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
-from scipy import stats
 
 from dbh_studio.core.arrays import Float64, readonly
 from dbh_studio.core.scale import MeasuredLength, ScaleEstimate, ScaleSource, ScaleVerdict, combine_lengths
@@ -19,6 +18,41 @@ BarLie = Literal["horizontal", "vertical", "oblique", "unknown"]
 SYSTEMATIC_SHARE = 0.0005
 _LEVEL_DEG = 30.0
 _LOW_PROBABILITY = 0.01
+
+
+class KnownLength(Protocol):
+    """What a scale can be taken from: a bar, or the side of a square marker."""
+
+    @property
+    def name(self) -> str:
+        """For the report."""
+
+    @property
+    def role(self) -> BarRole:
+        """``control`` sets the scale, ``check`` only tests it."""
+
+    @property
+    def length_m(self) -> float:
+        """The true length."""
+
+    @property
+    def length_se_m(self) -> float:
+        """Standard error of it: the tape, the print."""
+
+    @property
+    def measured_src(self) -> float:
+        """What it is in the reconstruction, source units."""
+
+    @property
+    def sigma_src(self) -> float:
+        """Standard error of that from scatter."""
+
+    @property
+    def systematic_src(self) -> float:
+        """Standard error of that from what all such lengths share."""
+
+    def lie(self, up_src: Float64 | None) -> BarLie:
+        """How it lies, where the up direction is known and it has a direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +92,22 @@ class Bar:
     def measured_src(self) -> float:
         """The distance in the reconstruction, source units."""
         return float(np.linalg.norm(self.q_src - self.p_src))
+
+    @property
+    def systematic_src(self) -> float:
+        """Nothing of its own; see `scale_from_bars`."""
+        return 0.0
+
+    def lie(self, up_src: Float64 | None) -> BarLie:
+        """Whether it lies or stands, where the up direction is known."""
+        if up_src is None:
+            return "unknown"
+        up = np.asarray(up_src, np.float64)
+        steepness = abs(float((self.q_src - self.p_src) @ up)) / (self.measured_src * float(np.linalg.norm(up)))
+        angle_deg = float(np.degrees(np.arcsin(min(steepness, 1.0))))
+        if angle_deg <= _LEVEL_DEG:
+            return "horizontal"
+        return "vertical" if angle_deg >= 90.0 - _LEVEL_DEG else "oblique"
 
 
 @dataclass(frozen=True)
@@ -122,7 +172,7 @@ def refused_scale(code: str, message: str, remedy: str) -> ScaleReport:
 
 
 def scale_from_bars(
-    bars: Sequence[Bar],
+    bars: Sequence[KnownLength],
     *,
     up_src: Float64 | None = None,
     source: ScaleSource = "bars",
@@ -131,7 +181,8 @@ def scale_from_bars(
     """The scale that fits the control bars best, tested on the check bars.
 
     Args:
-        bars: Control and check bars; in a plot with an up direction some should lie and some stand.
+        bars: Control and check bars (or other known lengths); in a plot with an up direction some should lie and some
+            stand.
         up_src: (3,) up direction in the source; None leaves lying and standing bars apart unknown.
         source: What the estimate is to be called.
         systematic_share: Share of the scale that no number of bars averages out.
@@ -151,7 +202,7 @@ def scale_from_bars(
                 bar.length_se_m,
                 bar.measured_src,
                 bar.sigma_src,
-                systematic_share * bar.measured_src,
+                float(np.hypot(systematic_share * bar.measured_src, bar.systematic_src)),
             )
             for bar in controls
         ]
@@ -164,7 +215,7 @@ def scale_from_bars(
     return ScaleReport(estimate, residuals, combined.chi2, combined.freedom, ratio, ratio_se, None, verdict)
 
 
-def _unusable(bars: Sequence[Bar]) -> ScaleReport | None:
+def _unusable(bars: Sequence[KnownLength]) -> ScaleReport | None:
     if not any(bar.role == "control" for bar in bars):
         return refused_scale("no_control", "No control bar is given.", "Mark at least one known distance as control.")
     for bar in bars:
@@ -180,27 +231,17 @@ def _unusable(bars: Sequence[Bar]) -> ScaleReport | None:
     return None
 
 
-def _lie(bar: Bar, up_src: Float64 | None) -> BarLie:
-    if up_src is None:
-        return "unknown"
-    up = np.asarray(up_src, np.float64)
-    steepness = abs(float((bar.q_src - bar.p_src) @ up)) / (bar.measured_src * float(np.linalg.norm(up)))
-    angle_deg = float(np.degrees(np.arcsin(min(steepness, 1.0))))
-    if angle_deg <= _LEVEL_DEG:
-        return "horizontal"
-    return "vertical" if angle_deg >= 90.0 - _LEVEL_DEG else "oblique"
-
-
-def _residual(bar: Bar, metres_per_unit: float, relative_se: float, up_src: Float64 | None) -> BarResidual:
+def _residual(bar: KnownLength, metres_per_unit: float, relative_se: float, up_src: Float64 | None) -> BarResidual:
     measured_m = metres_per_unit * bar.measured_src
     own = float(np.hypot(bar.sigma_src / bar.measured_src, bar.length_se_m / bar.length_m))
     # A check bar is not in the mean: the error of the mean comes on top of its own.
+    own = float(np.hypot(own, bar.systematic_src / bar.measured_src))
     sigma = float(np.hypot(own, relative_se)) if bar.role == "check" else float(np.hypot(own, SYSTEMATIC_SHARE))
     residual_m = measured_m - bar.length_m
     return BarResidual(
         bar.name,
         bar.role,
-        _lie(bar, up_src),
+        bar.lie(up_src),
         bar.length_m,
         measured_m,
         residual_m,
@@ -220,6 +261,13 @@ def _ratio(residuals: Sequence[BarResidual]) -> tuple[float | None, float | None
         means.append((1 + excess / 100, float(weights.sum()) ** -0.5 / 100))
     (across, across_se), (upright, upright_se) = means
     return across / upright, float(np.hypot(across_se, upright_se))
+
+
+def _chance(chi2: float, freedom: int) -> float:
+    """Probability of a larger chi-square."""
+    from scipy.special import chdtrc  # slow to import, and a plot's Document needs this module
+
+    return float(chdtrc(freedom, chi2))
 
 
 def _verdict(
@@ -250,7 +298,7 @@ def _verdict(
             f"{worst.length_m:.3f} m ({worst.residual_pct:+.2f} %).",
             "Check its length and ends; if they are right, the reconstruction is bent or the controls are wrong.",
         )
-    if freedom and stats.chi2.sf(chi2, freedom) < _LOW_PROBABILITY:
+    if freedom and _chance(chi2, freedom) < _LOW_PROBABILITY:
         worst = max((r for r in residuals if r.role == "control"), key=lambda r: r.n_sigma)
         return ScaleVerdict(
             "caution",

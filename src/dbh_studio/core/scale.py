@@ -8,7 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-ScaleSource = Literal["unknown", "metres", "feet", "millimetres", "factor", "marker", "bars"]
+ScaleSource = Literal[
+    "unknown", "metres", "feet", "millimetres", "factor", "marker", "bars", "camera_height", "baseline"
+]
+# Where nothing better exists: how high a person holds a camera, and how far apart two photos are said to be.
+WEAK_SOURCES: frozenset[ScaleSource] = frozenset({"camera_height", "baseline"})
 VerdictLevel = Literal["good", "caution", "refused"]
 
 

@@ -29,6 +29,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from dbh_studio.core.inventory import TreeRecord, check_text
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
+from dbh_studio.core.scale_evidence import MarkedPoint, MarkerSquare, ScaleBar, ScaleEvidence, Sight
 from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectVersionError
 from dbh_studio.io.atomic import atomic_file
@@ -90,6 +91,88 @@ class SavedTree(_Model):
     tree_id: int | None = Field(None, gt=0, le=MAX_TRUNK_ID)
 
 
+class SavedSight(_Model):
+    """A `Sight`."""
+
+    image: Text
+    u_px: float
+    v_px: float
+
+
+class SavedPoint(_Model):
+    """A `MarkedPoint`."""
+
+    xyz_src: tuple[float, float, float]
+    sigma_src: float = Field(0.0, ge=0)
+    sights: tuple[SavedSight, ...] = ()
+
+
+class SavedBar(_Model):
+    """A `ScaleBar`."""
+
+    name: Text
+    ends: tuple[SavedPoint, SavedPoint]
+    length_m: float = Field(gt=0)
+    length_se_m: float = Field(ge=0)
+    role: Literal["control", "check"]
+
+
+class SavedSquare(_Model):
+    """A `MarkerSquare`."""
+
+    name: Text
+    corners: tuple[SavedPoint, SavedPoint, SavedPoint, SavedPoint]
+    side_m: float = Field(gt=0)
+    side_se_m: float = Field(ge=0)
+    role: Literal["control", "check"]
+    marker: tuple[Text, int] | None = None
+    n_views: int | None = Field(None, ge=0)
+    side_sigma_src: float | None = Field(None, ge=0)
+    systematic_src: float = Field(0.0, ge=0)
+
+
+class SavedEvidence(_Model):
+    """A `ScaleEvidence`."""
+
+    bars: tuple[SavedBar, ...] = ()
+    squares: tuple[SavedSquare, ...] = ()
+    struck: tuple[tuple[Text, Text, int], ...] = ()
+
+    @classmethod
+    def of(cls, evidence: ScaleEvidence) -> SavedEvidence:
+        """What is saved of it."""
+        return cls.model_validate(asdict(evidence))
+
+    def evidence(self) -> ScaleEvidence:
+        """What was saved. Raises ValueError where it contradicts itself."""
+        bars = tuple(
+            ScaleBar(bar.name, _points(bar.ends), bar.length_m, bar.length_se_m, bar.role)  # type: ignore[arg-type]
+            for bar in self.bars
+        )
+        squares = tuple(
+            MarkerSquare(**(square.model_dump(exclude={"corners"}) | {"corners": _points(square.corners)}))
+            for square in self.squares
+        )
+        return ScaleEvidence(bars, squares, self.struck)
+
+
+def _points(saved: Iterable[SavedPoint]) -> tuple[MarkedPoint, ...]:
+    return tuple(
+        MarkedPoint(point.xyz_src, point.sigma_src, tuple(Sight(**sight.model_dump()) for sight in point.sights))
+        for point in saved
+    )
+
+
+class SavedCameras(_Model):
+    """Where the photos are; relative paths as of `SavedSource`."""
+
+    path: Text
+    relative_path: Text | None = None
+    images_dir: Text | None = None
+    relative_images_dir: Text | None = None
+    frame: Literal["cloud", "file"] = "cloud"
+
+
 class SavedProject(_Model):
     """project.json, schema version 1."""
 
@@ -102,13 +185,26 @@ class SavedProject(_Model):
     trunks_file: str = Field(pattern=f"^{_TRUNKS_FILE.pattern}$")
     next_id: int = Field(ge=1, le=MAX_TRUNK_ID + 1)
     trees: dict[int, SavedTree]
+    north_direction: tuple[float, float, float] | None = None
+    origin_src: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    evidence: SavedEvidence = SavedEvidence()
+    cameras: SavedCameras | None = None
 
-    @field_validator("up_direction")
+    @field_validator("up_direction", "north_direction")
     @classmethod
-    def _is_unit(cls, up: tuple[float, float, float]) -> tuple[float, float, float]:
-        if abs(sum(part * part for part in up) - 1) > 1e-6:
+    def _is_unit(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and abs(sum(part * part for part in up) - 1) > 1e-6:
             raise ValueError("is not of length 1")
         return up
+
+
+@dataclass(frozen=True)
+class CameraPlace:
+    """Where the photos of a plot are: the reconstruction, the photos, and how the poses come to the cloud."""
+
+    path: Path
+    images_dir: Path | None
+    frame: Literal["cloud", "file"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +227,10 @@ class PlotState:
     trunks: TrunkSet
     trees: Mapping[int, TreeRecord]
     other_source_path: Path | None = None
+    north_direction: tuple[float, float, float] | None = None
+    origin_src: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    evidence: ScaleEvidence = ScaleEvidence()
+    cameras: CameraPlace | None = None
 
 
 def is_project(path: Path | str) -> bool:
@@ -170,7 +270,31 @@ def read_project(folder: Path | str) -> PlotState:
         settings=saved.settings,
         trunks=trunks,
         trees={i: TreeRecord(**tree.model_dump()) for i, tree in saved.trees.items()},
+        north_direction=saved.north_direction,
+        origin_src=saved.origin_src,
+        evidence=_evidence(folder, saved.evidence),
+        cameras=None if saved.cameras is None else _camera_place(folder, saved.cameras),
     )
+
+
+def _evidence(folder: Path, saved: SavedEvidence) -> ScaleEvidence:
+    try:
+        return saved.evidence()
+    except ValueError as error:
+        raise _damaged(folder / PROJECT_FILE, f"evidence: {error}") from None
+
+
+def _camera_place(folder: Path, saved: SavedCameras) -> CameraPlace:
+    path = _there(folder, saved.path, saved.relative_path)
+    images = None if saved.images_dir is None else _there(folder, saved.images_dir, saved.relative_images_dir)
+    return CameraPlace(path, images, saved.frame)
+
+
+def _there(folder: Path, before: str, relative: str | None) -> Path:
+    """Beside the saved plot if there is such a file, else where it was."""
+    beside = None if relative is None else Path(os.path.normpath(folder / relative))
+    # os.path, not pathlib: that one raises where a folder may not be entered.
+    return beside if beside is not None and os.path.exists(beside) else Path(before)  # noqa: PTH110
 
 
 def _read_whole(folder: Path) -> tuple[SavedProject, TrunkSet]:
@@ -459,6 +583,21 @@ def _saved_project(state: PlotState, folder: Path, trunks_file: str, next_id: in
         trunks_file=trunks_file,
         next_id=max(state.trunks.next_id, next_id),
         trees={i: SavedTree(**asdict(record)) for i, record in sorted(state.trees.items())},
+        north_direction=state.north_direction,
+        origin_src=state.origin_src,
+        evidence=SavedEvidence.of(state.evidence),
+        cameras=None if state.cameras is None else _saved_cameras(state.cameras, folder),
+    )
+
+
+def _saved_cameras(cameras: CameraPlace, folder: Path) -> SavedCameras:
+    images = cameras.images_dir
+    return SavedCameras(
+        path=str(cameras.path),
+        relative_path=_relative(cameras.path, folder),
+        images_dir=None if images is None else str(images),
+        relative_images_dir=None if images is None else _relative(images, folder),
+        frame=cameras.frame,
     )
 
 

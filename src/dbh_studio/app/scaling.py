@@ -1,0 +1,339 @@
+"""The scale of a plot from markers and known lengths: found in photos, or marked by hand in the cloud or in photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dbh_studio.app.commands import Command, set_evidence, set_frame, set_scale
+from dbh_studio.app.document import Document
+from dbh_studio.core.arrays import Float64
+from dbh_studio.core.progress import Progress, ignore_progress
+from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.scale_evidence import MarkedPoint, MarkerKey, MarkerSquare, Sight
+from dbh_studio.errors import CommandError
+from dbh_studio.settings import MarkerSettings
+
+if TYPE_CHECKING:
+    from dbh_studio.core.bars import ScaleReport
+    from dbh_studio.core.cloud import PointCloud
+    from dbh_studio.core.dbh import Refusal
+    from dbh_studio.core.posed_images import PosedImages
+    from dbh_studio.stages.marker_detect import Detection
+    from dbh_studio.stages.marker_geometry import Marker3D
+
+# How well a person hits a corner in a photo, pixels of it.
+CLICK_SIGMA_PX = 1.0
+# How well a person keeps the height of a camera, and knows the distance of two photos.
+_HELD_SHARE = 0.05
+_PATH_SHARE = 0.02
+_MIN_CAMERAS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSearch:
+    """What a search for markers found.
+
+    Attributes:
+        detections: All sights, each with its picture.
+        squares: The markers in space that can be used, with the side they were given.
+        report: What the markers alone say of the scale.
+        problems: Per marker left out: its name and why.
+    """
+
+    detections: tuple[Detection, ...]
+    squares: tuple[MarkerSquare, ...]
+    report: ScaleReport
+    problems: tuple[tuple[str, Refusal], ...]
+
+
+# ---- found in photos
+
+
+def search_markers(
+    posed: PosedImages,
+    sides_m: Mapping[MarkerKey, float] | None = None,
+    struck: Sequence[tuple[str, str, int]] = (),
+    settings: MarkerSettings = MarkerSettings(),  # noqa: B008 - frozen
+    *,
+    progress: Progress = ignore_progress,
+) -> MarkerSearch:
+    """Look for markers in every photo and place them. Pure and picklable, for a job.
+
+    Args:
+        posed: The photos, in the cloud's frame.
+        sides_m: Side of the black square per (dictionary, id); the others have `settings.side_m`.
+        struck: (photo, dictionary, id) of detections to leave out.
+        settings: Dictionaries, ids, side.
+        progress: Called once per photo.
+
+    Raises:
+        FileError: No photo can be read.
+        MissingComponentError: OpenCV is absent.
+        SettingError: There is no dictionary of that name.
+    """
+    from dbh_studio.io.photos import read_photo
+    from dbh_studio.stages.markers import find_markers
+
+    detections = find_markers(posed, settings=settings, read_image=read_photo, progress=progress)
+    return place_markers(detections, posed, sides_m, struck, settings)
+
+
+def place_markers(
+    detections: Sequence[Detection],
+    posed: PosedImages,
+    sides_m: Mapping[MarkerKey, float] | None = None,
+    struck: Sequence[tuple[str, str, int]] = (),
+    settings: MarkerSettings = MarkerSettings(),  # noqa: B008 - frozen
+) -> MarkerSearch:
+    """The markers in space from detections, without those that were struck out. Takes well under a second."""
+    from dbh_studio.stages.markers import check_marker, scale_from_markers, triangulate_markers
+
+    left_out = set(struck)
+    believed = [d for d in detections if (d.image, d.dictionary, d.marker_id) not in left_out]
+    markers = triangulate_markers(believed, posed, settings=settings)
+    seen_once = sorted({detection.key for detection in believed} - {marker.key for marker in markers})
+    report = scale_from_markers(markers, sides_m, settings=settings, seen_once=seen_once)
+    used = {residual.name for residual in report.residuals}
+    problems = [(marker.name, check_marker(marker)) for marker in markers]
+    squares: list[MarkerSquare] = []
+    for marker in markers:
+        if marker.name in used:
+            # A number that stands at two places gives two squares of one name.
+            twins = sum(square.marker == marker.key for square in squares)
+            side_m = float((sides_m or {}).get(marker.key, settings.side_m))
+            squares.append(_square(marker, believed, side_m, settings, twins))
+    return MarkerSearch(
+        tuple(detections), tuple(squares), report, tuple((name, why) for name, why in problems if why is not None)
+    )
+
+
+def _square(
+    marker: Marker3D, detections: Sequence[Detection], side_m: float, settings: MarkerSettings, twins: int
+) -> MarkerSquare:
+    used = [d for d in detections if d.key == marker.key and d.image in set(marker.views_used)]
+    corners = []
+    for number in range(4):
+        block = marker.covariance[3 * number : 3 * number + 3, 3 * number : 3 * number + 3]
+        sights = tuple(Sight(d.image, *(float(value) for value in d.corners_px[number])) for d in used)
+        sigma = float(np.sqrt(np.trace(block) / 3))
+        corners.append(MarkedPoint(tuple(marker.corners_src[number]), sigma, sights))
+    first, second, third, fourth = corners
+    return MarkerSquare(
+        name=marker.name if not twins else f"{marker.name} ({twins + 1})",
+        corners=(first, second, third, fourth),
+        side_m=side_m,
+        side_se_m=settings.side_error_mm / 1000,
+        marker=marker.key,
+        n_views=len(marker.views_used),
+        side_sigma_src=marker.side_sigma_src,
+        # Both ends of every side move outwards or inwards alike.
+        systematic_src=2 * settings.systematic_px * marker.footprint_src,
+    )
+
+
+def apply_search(document: Document, search: MarkerSearch) -> Command:
+    """One step: keep the markers found, and take the scale from them and the lengths marked by hand.
+
+    Raises:
+        CommandError: They give no scale; says why. The evidence is then not touched either.
+    """
+    evidence = document.evidence.with_found(search.squares)
+    report = evidence.report(np.array(document.up_direction)) if search.squares else search.report
+    if report.estimate is None:
+        raise CommandError(report.verdict.message, report.verdict.remedy)
+    return set_evidence(evidence, label="Set the scale by markers", scale=report.estimate)
+
+
+# ---- marked by hand
+
+
+def point_from_sights(
+    sights: Sequence[Sight], posed: PosedImages, *, sigma_px: float = CLICK_SIGMA_PX
+) -> TriangulatedPoint | Refusal:
+    """The point that several photos show, or why they show none.
+
+    Args:
+        sights: One per photo.
+        posed: The photos, in the cloud's frame.
+        sigma_px: How well the point was hit.
+    """
+    from dbh_studio.core.dbh import Refusal
+    from dbh_studio.core.triangulation import triangulate
+
+    rays, origins, sigmas = [], [], []
+    for sight in sights:
+        photo = posed.by_name(sight.image)
+        uv = np.array([[sight.u_px, sight.v_px], [sight.u_px + 0.5, sight.v_px], [sight.u_px, sight.v_px + 0.5]])
+        origin, directions = photo.ray(uv)
+        step = np.nanmax([_angle(directions[0], directions[1]), _angle(directions[0], directions[2])])
+        origins.append(origin)
+        rays.append(directions[0])
+        sigmas.append(sigma_px * 2 * max(float(step), 1e-9))
+    if not rays:
+        return Refusal("one_view", "The point is marked in no photo.", "Mark it in two or more photos.")
+    result = triangulate(np.array(origins), np.array(rays), np.array(sigmas))
+    if isinstance(result, Refusal):
+        return result
+    distance = np.linalg.norm(np.array(origins) - result.point, axis=1)
+    residual_px = result.residuals_rad / (np.array(sigmas) / sigma_px)
+    sigma_src = float(np.sqrt(np.trace(result.covariance) / 3))
+    point = MarkedPoint(tuple(result.point), sigma_src, tuple(sights))
+    return TriangulatedPoint(
+        point, tuple(residual_px), tuple(result.inliers.tolist()), result.parallax_deg, tuple(distance)
+    )
+
+
+def _angle(a: Float64, b: Float64) -> float:
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+@dataclass(frozen=True)
+class TriangulatedPoint:
+    """A point from photos.
+
+    Attributes:
+        point: Where it is, with its error and sights.
+        residuals_px: Per sight, how far the point is from where it was marked, pixels.
+        is_used: Per sight, whether it agrees with the others.
+        parallax_deg: Largest angle between two rays; below 5° the distance is weak.
+        distances_src: Per sight, from camera to point.
+    """
+
+    point: MarkedPoint
+    residuals_px: tuple[float, ...]
+    is_used: tuple[bool, ...]
+    parallax_deg: float
+    distances_src: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A photo in which a point should be visible too: `u_px`, `v_px` where, `distance_src` how far from the camera."""
+
+    image: str
+    u_px: float
+    v_px: float
+    distance_src: float
+
+
+def photos_of_point(
+    point_src: Float64, posed: PosedImages, *, without: Sequence[str] = (), at_most: int = 12
+) -> tuple[Suggestion, ...]:
+    """Photos that have a point in view, nearest first; what stands in between is not known.
+
+    Args:
+        point_src: (3,) absolute source coordinates; roughly is enough.
+        posed: The photos, in the cloud's frame.
+        without: Photos not to name.
+        at_most: How many.
+    """
+    left_out, found = set(without), []
+    for photo in posed:
+        if photo.name in left_out or photo.path is None:
+            continue
+        uv, in_view = photo.project(np.asarray(point_src, np.float64)[None])
+        if in_view[0]:
+            distance = float(np.linalg.norm(photo.centre_src - point_src))
+            found.append(Suggestion(photo.name, float(uv[0, 0]), float(uv[0, 1]), distance))
+    return tuple(sorted(found, key=lambda each: each.distance_src)[:at_most])
+
+
+def scale_from_evidence(document: Document, *, label: str = "Set the scale by known lengths") -> Command:
+    """Take the scale from the control lengths of the plot.
+
+    Raises:
+        CommandError: They give none; says why.
+    """
+    report = document.evidence.report(np.array(document.up_direction))
+    if report.estimate is None:
+        raise CommandError(report.verdict.message, report.verdict.remedy)
+    return Command(label, set_scale(report.estimate).apply)
+
+
+# ---- where nothing else exists
+
+
+def scale_from_baseline(posed: PosedImages, first: str, second: str, distance_m: float) -> ScaleEstimate:
+    """From the distance between two photos, walked or of a rig. Weak.
+
+    Raises:
+        CommandError: The two are at one place, or the distance makes no sense.
+    """
+    _check_length(distance_m, "The distance between the two photos")
+    gap = float(np.linalg.norm(posed.by_name(first).centre_src - posed.by_name(second).centre_src))
+    if not gap > 0:
+        raise CommandError("Both photos were taken at one place.", "Choose two photos that are farther apart.")
+    scale = distance_m / gap
+    return ScaleEstimate(scale, "baseline", _PATH_SHARE * scale)
+
+
+def scale_from_camera_height(
+    posed: PosedImages, cloud: PointCloud, up_direction: Float64, height_m: float
+) -> ScaleEstimate:
+    """From how high above the ground the camera was carried. Weak: ground and arm both move.
+
+    The ground under a camera is the low side of the cloud around it, as far as the camera is high.
+
+    Raises:
+        CommandError: The ground is seen under fewer than three cameras, or the height makes no sense.
+    """
+    _check_length(height_m, "The height of the camera")
+    heights = _camera_heights(posed, cloud, np.asarray(up_direction, np.float64))
+    if len(heights) < _MIN_CAMERAS:
+        raise CommandError(
+            "The ground is seen under too few of the cameras.", "Check the up axis, or mark a known distance instead."
+        )
+    middle = float(np.median(heights))
+    spread = 1.4826 * float(np.median(np.abs(heights - middle))) / middle
+    scale = height_m / middle
+    return ScaleEstimate(scale, "camera_height", scale * float(np.hypot(_HELD_SHARE, spread / np.sqrt(len(heights)))))
+
+
+def _camera_heights(posed: PosedImages, cloud: PointCloud, up: Float64) -> Float64:
+    """(K,) heights of the cameras above the ground under them, source units."""
+    from scipy.spatial import cKDTree
+
+    from dbh_studio.core.updirection import rotation_from_up
+
+    rotation = rotation_from_up(up)
+    step = max(1, len(cloud) // 2_000_000)
+    points = cloud.xyz[::step].astype(np.float64) @ rotation.T
+    centres = (posed.centres_src - cloud.origin) @ rotation.T
+    tree = cKDTree(points[:, :2])
+    extent = float(np.ptp(centres[:, :2], axis=0).max())
+    # In an unknown unit the only length at hand is the walk itself.
+    radius = max(0.05 * extent, 1e-12)
+    heights = []
+    for centre, rows in zip(centres, tree.query_ball_point(centres[:, :2], radius), strict=True):
+        if len(rows) >= 20:
+            heights.append(centre[2] - float(np.quantile(points[rows, 2], 0.05)))
+    found = np.array(heights, np.float64)
+    return np.asarray(found[found > 0])
+
+
+def _check_length(value_m: float, what: str) -> None:
+    if not (np.isfinite(value_m) and 0.001 <= value_m <= 10_000):
+        raise CommandError(f"{what} cannot be {value_m:g} m.", "Give it in metres, above 0.")
+
+
+# ---- up, origin and north
+
+
+def frame_from_square(
+    square: MarkerSquare, cloud: PointCloud, *, up: bool = True, origin: bool = True, north: bool = True
+) -> Command:
+    """Let a marker that lies flat say where the sky, the plot's origin and north are.
+
+    Raises:
+        CommandError: Its corners span no plane.
+    """
+    try:
+        normal, middle, top = square.frame()
+    except ValueError as error:
+        raise CommandError(f"{square.name} gives no directions: {error}.") from None
+    offset = np.array(middle) - cloud.origin
+    return set_frame(up=normal if up else None, north=top if north else None, origin_src=offset if origin else None)
