@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
+from tests.photoplot import PhotoPlot, write_photo_plot
 
 from dbh_studio.app.doctor import find_chromium
 
@@ -35,3 +36,9 @@ def chromium_path() -> str:
             pytest.fail(message)
         pytest.skip(message)
     return path
+
+
+@pytest.fixture(scope="session")
+def photo_plot(tmp_path_factory: pytest.TempPathFactory) -> PhotoPlot:
+    """A plot with rendered panoramas and markers; tests must not write into its folder."""
+    return write_photo_plot(tmp_path_factory.mktemp("photo_plot"))

@@ -20,7 +20,7 @@ from tests.threestems import STEMS, plot_cloud, plot_points, stem_points
 
 from dbh_studio.app import commands, doctor, opening, pipeline
 from dbh_studio.cli import build_parser, main
-from dbh_studio.cli.common import ProgressLine
+from dbh_studio.cli.common import ProgressLine, photo_request
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import COLUMNS
 from dbh_studio.errors import ProjectExistsError
@@ -28,7 +28,7 @@ from dbh_studio.io.las import write_las
 from dbh_studio.io.ply import write_ply
 from dbh_studio.io.project import ProjectWriter, read_project
 
-COMMANDS = ("open", "demo", "run", "measure", "doctor", "settings")
+COMMANDS = ("open", "demo", "run", "measure", "scale", "marker", "doctor", "settings")
 DIAMETERS_CM = [100 * diameter for _, _, diameter in STEMS]
 
 
@@ -578,4 +578,22 @@ def test_a_name_that_a_spreadsheet_would_run(stems, tmp_path, capsys, monkeypatc
     shutil.copy(stems[0], "=1+1.las")
     assert main(["measure", "=1+1.las"]) == 0
     (row,) = table(capsys.readouterr().out)
-    assert row["file"] == "./=1+1.las" and row["dbh_cm"]
+    assert row["file"] == "'=1+1.las" and row["dbh_cm"]
+    # As in the inventory: also behind a semicolon, where that separates cells.
+    shutil.copy(stems[0], "a;=1+1.las")
+    assert main(["measure", "a;=1+1.las"]) == 0
+    assert table(capsys.readouterr().out)[0]["file"] == "a;'=1+1.las"
+    assert main(["measure", "=1+1.las", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["file"] == "=1+1.las"
+
+
+@pytest.mark.parametrize("height", ["nan", "inf", "low"])
+def test_a_ground_that_is_no_height_is_wrong_usage(stems, capsys, height):
+    assert "not a number" in fails(capsys, ["measure", stems[0], "--ground-z", height], 2)
+
+
+def test_a_marker_is_named_by_any_dictionary_that_holds_it():
+    """DICT_4X4_250 begins with the markers of DICT_4X4_50, under whose name they are found."""
+    arguments = ["--marker", "4x4_250:7=0.5", "--marker", "DICT_4X4_250:200=0.4", "--marker", "12=0.3"]
+    options = build_parser().parse_args(["run", "plot.las", "--out", "out", *arguments])
+    assert photo_request(options).sides == {"DICT_4X4_50 7": 0.5, "DICT_4X4_250 200": 0.4, "12": 0.3}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +19,9 @@ from numpy.typing import NDArray
 from dbh_studio.app.commands import change_settings, rename_plot, replace_trunks
 from dbh_studio.app.document import Direction, Document
 from dbh_studio.app.jobs import run_job
-from dbh_studio.app.opening import open_plot, plot_name, save_as, scale_from
+from dbh_studio.app.opening import open_plot, plot_name, read_cloud, save_as, scale_from
 from dbh_studio.app.session import Session
-from dbh_studio.app.threads import map_in_threads
+from dbh_studio.app.threads import CallAhead, map_in_threads
 from dbh_studio.core.arrays import Float32
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate
@@ -30,7 +32,9 @@ from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
 from dbh_studio.settings import GroundSettings, MeasureSettings, Settings
 
 if TYPE_CHECKING:
+    from dbh_studio.app.photo_scale import PhotoRequest
     from dbh_studio.core.ground import GroundModel
+    from dbh_studio.core.reconstruction import Reconstruction
     from dbh_studio.stages.measure import StemMeasurement
 
 __all__ = [
@@ -163,11 +167,21 @@ def apply_segmentation(session: Session, document: Document, result: Segmentatio
     session.do(replace_trunks(trunks), based_on=document, reads=SEGMENTATION_READS)
 
 
-def segment(session: Session, *, progress: Progress = ignore_progress, in_process: bool = False) -> tuple[str, ...]:
-    """Find the trunks of a plot and wait for them; the notes."""
+def segment(
+    session: Session,
+    *,
+    progress: Progress = ignore_progress,
+    in_process: bool = False,
+    ahead: CallAhead | None = None,
+) -> tuple[str, ...]:
+    """Find the trunks of a plot and wait for them; the notes. `ahead` may have begun with it, see `_read_and_begin`."""
     document = session.document
     call = segmentation_call(session, document)
-    result: SegmentationResult = run_job(segment_plot, *call, progress=progress, in_process=in_process)
+    result: SegmentationResult
+    if ahead is not None:
+        result = ahead.call(segment_plot, *call, progress=progress)
+    else:
+        result = run_job(segment_plot, *call, progress=progress, in_process=in_process)
     apply_segmentation(session, document, result)
     return result[2]
 
@@ -248,6 +262,7 @@ def run_plot(
     scale: float | str | ScaleEstimate | None = None,
     up: str | Direction | None = None,
     settings: Settings | Mapping[str, Mapping[str, Any]] | None = None,
+    photos: PhotoRequest | None = None,
     plot_id: str = "",
     relocate: Path | str | None = None,
     overwrite: bool = False,
@@ -261,6 +276,7 @@ def run_plot(
     Args:
         settings: Instead of the defaults, or of those the saved plot has; as section -> name -> value, only the named
             ones are changed.
+        photos: Take the scale from markers in these photos.
         plot_id: What to call the plot; the file's name by default.
         relocate: Where the cloud of a saved plot is now.
         overwrite: Replace a plot that an earlier run left in `out_dir`, and ``NAME.csv``. Edits made in them are lost.
@@ -286,18 +302,27 @@ def run_plot(
     _check_table(csv_path, path, is_saved=is_saved, overwrite=overwrite)
     _check_writable(out_dir)
     timings_s: dict[str, float] = {}
-    with _timed(timings_s, "read"):
+    # Both cores from the beginning: the trunks are looked for while the data are still being looked at.
+    ahead = CallAhead() if in_process and not (is_saved or photos or settings) else None
+    with _timed(timings_s, "read"), ahead or nullcontext():
         part = subprogress(progress, 0.0, 0.3)
-        session = open_plot(path, scale=scale, up=up, relocate=relocate, background_save=False, progress=part)
+        read = read_cloud if ahead is None else partial(_read_and_begin, ahead)
+        session = open_plot(
+            path, scale=scale, up=up, relocate=relocate, background_save=False, read=read, progress=part
+        )
     try:
         # Only now are the files of a folder known, and where a saved plot found its cloud.
         check_not_source(csv_path, session.document.source.used)
         _configure(session, settings, plot_id)
-        session.require_scale()
         notes = [*session.notes]
+        if photos is not None:
+            with _timed(timings_s, "scale"):
+                notes += _scaled(session, photos, in_process=in_process, progress=progress)
+        session.require_scale()
         if not len(session.document.trunks):
             with _timed(timings_s, "ground and trunks"):
-                notes += segment(session, progress=subprogress(progress, 0.3, 0.7), in_process=in_process)
+                part = subprogress(progress, 0.3, 0.7)
+                notes += segment(session, progress=part, in_process=in_process, ahead=ahead)
         elif is_saved:
             notes.append(f"The trunks are those the plot was saved with ({len(session.document.trunks)}).")
         with _timed(timings_s, "diameters"):
@@ -309,12 +334,46 @@ def run_plot(
             write_inventory_csv(csv_path, inventory)
             session.flush()
     except BaseException:
+        if ahead is not None:
+            ahead.give_up()
         session.close()
         raise
     if inventory.n_refused:
         notes.append(f"{inventory.n_refused} of {len(inventory)} stems have no diameter; the table says why.")
     progress(1.0, "")
     return RunResult(session, csv_path, project_dir, tuple(notes), timings_s)
+
+
+def _scaled(session: Session, photos: PhotoRequest, *, in_process: bool, progress: Progress) -> list[str]:
+    """Set the scale by markers; what the person should know of it."""
+    from dbh_studio.app.photo_scale import scale_by_photos
+
+    verdict = scale_by_photos(session, photos, in_process=in_process, progress=progress).report.verdict
+    return [f"{verdict.message} {verdict.remedy}".strip()]
+
+
+def _read_and_begin(ahead: CallAhead, path: Path, *, progress: Progress = ignore_progress) -> Reconstruction:
+    """Read a cloud, and begin to look for its trunks as it lies: nearly every LiDAR file is in metres with +z up."""
+    from dbh_studio.core.treeids import find_tree_id_attribute
+
+    # Decompressing holds no lock of Python's, so the imports of what comes next go on beside it.
+    imports = threading.Thread(target=_import_stages)
+    imports.start()
+    try:
+        reconstruction = read_cloud(path, progress=progress)
+    finally:
+        imports.join()
+    if reconstruction.provenance.is_lidar and find_tree_id_attribute(reconstruction.cloud) is None:
+        ahead.begin(segment_plot, reconstruction.cloud.xyz, Settings(), None)
+    return reconstruction
+
+
+def _import_stages() -> None:
+    """Import what looking at the data, finding trunks and measuring them need; what is broken is told where it is used."""
+    with suppress(Exception):
+        import dbh_studio.core.datacheck
+        import dbh_studio.stages.measure
+        import dbh_studio.stages.segment  # noqa: F401
 
 
 @contextmanager

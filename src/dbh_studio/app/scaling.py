@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dbh_studio.app.commands import Command, set_evidence, set_frame, set_scale
 from dbh_studio.app.document import Document
+from dbh_studio.app.lengths import check_length
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.core.scale import ScaleEstimate
@@ -31,6 +32,8 @@ CLICK_SIGMA_PX = 1.0
 _HELD_SHARE = 0.05
 _PATH_SHARE = 0.02
 _MIN_CAMERAS = 3
+# Rays that meet at less say little about the distance.
+_GOOD_PARALLAX_DEG = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +103,8 @@ def place_markers(
     used = {residual.name for residual in report.residuals}
     problems = [(marker.name, check_marker(marker)) for marker in markers]
     squares: list[MarkerSquare] = []
-    for marker in markers:
-        if marker.name in used:
+    for marker, (_, problem) in zip(markers, problems, strict=True):
+        if marker.name in used and problem is None:
             # A number that stands at two places gives two squares of one name.
             twins = sum(square.marker == marker.key for square in squares)
             side_m = float((sides_m or {}).get(marker.key, settings.side_m))
@@ -122,6 +125,10 @@ def _square(
         sigma = float(np.sqrt(np.trace(block) / 3))
         corners.append(MarkedPoint(tuple(marker.corners_src[number]), sigma, sights))
     first, second, third, fourth = corners
+    # Both ends of every side move outwards or inwards alike; the photos may have told by how much.
+    systematic = 2 * settings.systematic_px * marker.footprint_src
+    if marker.size_drift is not None:
+        systematic = marker.size_drift * marker.side_src
     return MarkerSquare(
         name=marker.name if not twins else f"{marker.name} ({twins + 1})",
         corners=(first, second, third, fourth),
@@ -130,8 +137,7 @@ def _square(
         marker=marker.key,
         n_views=len(marker.views_used),
         side_sigma_src=marker.side_sigma_src,
-        # Both ends of every side move outwards or inwards alike.
-        systematic_src=2 * settings.systematic_px * marker.footprint_src,
+        systematic_src=systematic,
     )
 
 
@@ -146,6 +152,56 @@ def apply_search(document: Document, search: MarkerSearch) -> Command:
     if report.estimate is None:
         raise CommandError(report.verdict.message, report.verdict.remedy)
     return set_evidence(evidence, label="Set the scale by markers", scale=report.estimate)
+
+
+def strike_out(
+    document: Document,
+    detections: Sequence[Detection],
+    posed: PosedImages,
+    sight: tuple[str, str, int],
+    *,
+    struck: bool = True,
+) -> Command:
+    """One step: leave one detection out (or take it in again), place the markers anew, and take the scale from them.
+
+    A scale that was not measured on known lengths is left alone, as is one for which nothing is left.
+
+    Args:
+        document: The plot.
+        detections: All of the search.
+        posed: The photos, in the cloud's frame.
+        sight: (photo, dictionary, id).
+        struck: Whether it is no marker.
+    """
+    others = tuple(each for each in document.evidence.struck if each != sight)
+    left_out = (*others, sight) if struck else others
+    search = place_markers(detections, posed, sides_of(document), left_out)
+    evidence = replace(document.evidence, struck=left_out).with_found(search.squares)
+    report = evidence.report(np.array(document.up_direction))
+    is_measured = document.scale.source in ("unknown", "marker", "bars")
+    what = f"{sight[1]} {sight[2]} in {sight[0]}"
+    label = f"Strike out {what}" if struck else f"Use {what} again"
+    return set_evidence(evidence, label=label, scale=report.estimate if is_measured else None)
+
+
+def sides_of(document: Document) -> dict[MarkerKey, float]:
+    """The side of each marker found so far."""
+    return {square.marker: square.side_m for square in document.evidence.squares if square.marker is not None}
+
+
+def change_side(document: Document, before_m: float, side_m: float) -> Command:
+    """Give all markers found in photos that have the side `before_m` another one, in one step.
+
+    Raises:
+        CommandError: No marker can be as large.
+    """
+    check_length(side_m, "The side of the black square")
+    squares = tuple(
+        replace(square, side_m=side_m) if square.marker is not None and square.side_m == before_m else square
+        for square in document.evidence.squares
+    )
+    evidence = replace(document.evidence, squares=squares)
+    return set_evidence(evidence, label=f"Change the markers' side to {side_m:g} m")
 
 
 # ---- marked by hand
@@ -166,13 +222,20 @@ def point_from_sights(
 
     rays, origins, sigmas = [], [], []
     for sight in sights:
-        photo = posed.by_name(sight.image)
+        try:
+            photo = posed.by_name(sight.image)
+        except KeyError:
+            return Refusal("no_photo", f"The photo {sight.image} is gone.", "Take the point out of it.")
         uv = np.array([[sight.u_px, sight.v_px], [sight.u_px + 0.5, sight.v_px], [sight.u_px, sight.v_px + 0.5]])
         origin, directions = photo.ray(uv)
-        step = np.nanmax([_angle(directions[0], directions[1]), _angle(directions[0], directions[2])])
+        if not np.isfinite(directions[0]).all():
+            return Refusal("bad_ray", f"{sight.image} shows nothing there.", "Mark the point inside the picture.")
+        # At the border of the lens the pixel beside may have no direction.
+        beside = [_angle(directions[0], other) for other in directions[1:] if np.isfinite(other).all()]
+        step = max(beside, default=0.0)
         origins.append(origin)
         rays.append(directions[0])
-        sigmas.append(sigma_px * 2 * max(float(step), 1e-9))
+        sigmas.append(sigma_px * 2 * max(step, 1e-9))
     if not rays:
         return Refusal("one_view", "The point is marked in no photo.", "Mark it in two or more photos.")
     result = triangulate(np.array(origins), np.array(rays), np.array(sigmas))
@@ -225,21 +288,29 @@ def photos_of_point(
 ) -> tuple[Suggestion, ...]:
     """Photos that have a point in view, nearest first; what stands in between is not known.
 
+    Those that look at it from nearly the same side as one of `without` come last: they say little about its distance.
+
     Args:
         point_src: (3,) absolute source coordinates; roughly is enough.
         posed: The photos, in the cloud's frame.
-        without: Photos not to name.
+        without: Photos not to name: the point is marked in them.
         at_most: How many.
     """
-    left_out, found = set(without), []
+    point = np.asarray(point_src, np.float64)
+    left_out = set(without)
+    marked_from = [point - photo.centre_src for photo in posed if photo.name in left_out]
+    found: list[tuple[bool, Suggestion]] = []
     for photo in posed:
         if photo.name in left_out or photo.path is None:
             continue
-        uv, in_view = photo.project(np.asarray(point_src, np.float64)[None])
+        uv, in_view = photo.project(point[None])
         if in_view[0]:
-            distance = float(np.linalg.norm(photo.centre_src - point_src))
-            found.append(Suggestion(photo.name, float(uv[0, 0]), float(uv[0, 1]), distance))
-    return tuple(sorted(found, key=lambda each: each.distance_src)[:at_most])
+            towards = point - photo.centre_src
+            is_alike = any(np.degrees(_angle(towards, other)) < _GOOD_PARALLAX_DEG for other in marked_from)
+            suggestion = Suggestion(photo.name, float(uv[0, 0]), float(uv[0, 1]), float(np.linalg.norm(towards)))
+            found.append((is_alike, suggestion))
+    found.sort(key=lambda each: (each[0], each[1].distance_src))
+    return tuple(suggestion for _, suggestion in found[:at_most])
 
 
 def scale_from_evidence(document: Document, *, label: str = "Set the scale by known lengths") -> Command:
@@ -263,8 +334,11 @@ def scale_from_baseline(posed: PosedImages, first: str, second: str, distance_m:
     Raises:
         CommandError: The two are at one place, or the distance makes no sense.
     """
-    _check_length(distance_m, "The distance between the two photos")
-    gap = float(np.linalg.norm(posed.by_name(first).centre_src - posed.by_name(second).centre_src))
+    check_length(distance_m, "The distance between the two photos")
+    try:
+        gap = float(np.linalg.norm(posed.by_name(first).centre_src - posed.by_name(second).centre_src))
+    except KeyError as error:
+        raise CommandError(f"There is no photo {error.args[0]}.", "Choose two photos of this plot.") from None
     if not gap > 0:
         raise CommandError("Both photos were taken at one place.", "Choose two photos that are farther apart.")
     scale = distance_m / gap
@@ -281,7 +355,7 @@ def scale_from_camera_height(
     Raises:
         CommandError: The ground is seen under fewer than three cameras, or the height makes no sense.
     """
-    _check_length(height_m, "The height of the camera")
+    check_length(height_m, "The height of the camera")
     heights = _camera_heights(posed, cloud, np.asarray(up_direction, np.float64))
     if len(heights) < _MIN_CAMERAS:
         raise CommandError(
@@ -313,11 +387,6 @@ def _camera_heights(posed: PosedImages, cloud: PointCloud, up: Float64) -> Float
             heights.append(centre[2] - float(np.quantile(points[rows, 2], 0.05)))
     found = np.array(heights, np.float64)
     return np.asarray(found[found > 0])
-
-
-def _check_length(value_m: float, what: str) -> None:
-    if not (np.isfinite(value_m) and 0.001 <= value_m <= 10_000):
-        raise CommandError(f"{what} cannot be {value_m:g} m.", "Give it in metres, above 0.")
 
 
 # ---- up, origin and north

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import math
 import re
 import shutil
 import sys
 import time
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from dbh_studio.errors import SettingError, UnscaledCloudError
 
+if TYPE_CHECKING:
+    from dbh_studio.app.photo_scale import PhotoRequest
+
+_LARGEST_SIDE_M = 10.0
 UP_AXES = ("+z", "-z", "+y", "-y", "+x", "-x")
 
 
@@ -52,6 +57,81 @@ def add_settings_options(parser: argparse.ArgumentParser, *, only_measure: bool 
     )
 
 
+def add_photo_options(parser: argparse.ArgumentParser) -> None:
+    """Options that take the scale from markers in photos."""
+    photos = parser.add_argument_group("scale from markers in photos")
+    photos.add_argument(
+        "--cameras",
+        type=path_argument,
+        metavar="PATH",
+        help="poses of the photos: a COLMAP model, Metashape XML, OpenSfM or ODM folder, or a table of poses; without "
+        "it they are looked for beside the cloud",
+    )
+    photos.add_argument("--images", type=path_argument, metavar="DIR", help="folder of the photos, if not beside them")
+    photos.add_argument(
+        "--marker-side",
+        type=finite_number,
+        metavar="M",
+        help="outer edge of the markers' black squares, metres; 1 if only --cameras is given",
+    )
+    photos.add_argument(
+        "--marker",
+        action="append",
+        default=[],
+        dest="markers",
+        metavar="ID=M",
+        help="side of one marker, such as 12=0.5 or DICT_4X4_50:12=0.5; may be given several times",
+    )
+    photos.add_argument(
+        "--dictionary",
+        action="append",
+        default=[],
+        dest="dictionaries",
+        metavar="NAME",
+        help="dictionary of the markers, such as DICT_4X4_50; guessed where none is named",
+    )
+
+
+def photo_request(options: argparse.Namespace) -> PhotoRequest | None:
+    """What the photo options ask for; None where none is given.
+
+    Raises:
+        SettingError: A side or a dictionary cannot be.
+    """
+    given = (options.cameras, options.images, options.marker_side, *options.markers, *options.dictionaries)
+    if all(value is None for value in given):
+        return None
+    from dbh_studio.app.photo_scale import PhotoRequest
+    from dbh_studio.io.marker_codes import known_name
+    from dbh_studio.settings import MarkerSettings
+
+    changes: dict[str, Any] = {"dictionaries": tuple(known_name(name) for name in options.dictionaries)}
+    if options.marker_side is not None:
+        changes["side_m"] = options.marker_side
+    sides = dict(_marker_side(text) for text in options.markers)
+    return PhotoRequest(options.cameras, options.images, sides, MarkerSettings().changed(**changes))
+
+
+def _marker_side(text: str) -> tuple[str, float]:
+    """``12=0.5`` or ``DICT_4X4_50:12=0.5`` as the name of the marker and its side."""
+    name, _, value = text.partition("=")
+    dictionary, _, number = name.rpartition(":")
+    try:
+        side_m = float(value)
+        if not number.strip().isdigit() or not 0.0 < side_m <= _LARGEST_SIDE_M:
+            raise ValueError
+    except ValueError:
+        raise SettingError(
+            f"--marker {text}: expected ID=SIDE, the side in metres.", "For example 12=0.5 or DICT_4X4_50:12=0.5."
+        ) from None
+    if not dictionary:
+        return str(int(number)), side_m
+    from dbh_studio.io.marker_codes import known_name, smallest_dictionary
+
+    # What is found has the name of the smallest dictionary that holds it, whatever is printed on the board.
+    return f"{smallest_dictionary(known_name(dictionary), int(number))} {int(number)}", side_m
+
+
 def path_argument(text: str) -> Path:
     """A path; an empty one, as from an unset variable of a script, is not the folder one happens to be in."""
     if not text.strip():
@@ -67,6 +147,17 @@ def positive_integer(text: str) -> int:
         value = 0
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
+    return value
+
+
+def finite_number(text: str) -> float:
+    """A number that is neither infinite nor no number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
     return value
 
 
@@ -141,8 +232,8 @@ def unscaled_error() -> UnscaledCloudError:
     return UnscaledCloudError(
         "The file does not tell how long its unit is, so no diameter can be given.",
         "Say it: --scale metres (or feet, us-feet, centimetres, millimetres), or metres per unit such as "
-        "--scale 1.332. A cloud from photographs has a scale of its own: open it in the studio with `dbh-studio open` "
-        "and set it there by markers or a length measured in the field.",
+        "--scale 1.332. A cloud from photographs has a scale of its own: measure it by markers or a known distance, "
+        "with `dbh-studio scale` or in the studio (`dbh-studio open`) under Scale.",
     )
 
 

@@ -10,16 +10,18 @@ from typing import Any
 
 from dbh_studio.cli.common import (
     add_cloud_options,
+    add_photo_options,
     add_relocation_option,
     add_settings_options,
     counted,
     path_argument,
+    photo_request,
     plain,
     progress_for,
     settings_changes,
     unscaled_error,
 )
-from dbh_studio.errors import ProjectExistsError, ProjectLockedError, UnscaledCloudError
+from dbh_studio.errors import ProjectExistsError, ProjectLockedError, SettingError, UnscaledCloudError
 
 
 def add_commands(commands: Any) -> None:
@@ -41,6 +43,7 @@ def add_commands(commands: Any) -> None:
     add_cloud_options(run)
     add_relocation_option(run)
     add_settings_options(run)
+    add_photo_options(run)
     run.add_argument("--name", default="", help="what to call the plot; the file's name by default")
     run.add_argument(
         "--overwrite",
@@ -57,6 +60,9 @@ def run_plot(options: argparse.Namespace) -> int:
     from dbh_studio.app import pipeline
 
     changes = settings_changes(options)
+    photos = photo_request(options)
+    if photos is not None and options.scale is not None:
+        raise SettingError("Both --scale and markers in photos were given.", "Leave one of them away.")
     try:
         with progress_for(options) as progress:
             result = pipeline.run_plot(
@@ -65,6 +71,7 @@ def run_plot(options: argparse.Namespace) -> int:
                 scale=options.scale,
                 up=options.up,
                 settings=changes,
+                photos=photos,
                 plot_id=options.name,
                 relocate=options.cloud,
                 overwrite=options.overwrite,
@@ -103,6 +110,7 @@ def _summary(result: Any, inventory: Any) -> dict[str, Any]:
         "n_refused": inventory.n_refused,
         "metres_per_unit": scale.metres_per_unit,
         "scale_source": scale.source,
+        "scale_err_pct": _rounded(_percent(scale.standard_error, scale.metres_per_unit), 4),
         "notes": list(result.notes),
         "seconds": {step: round(seconds, 3) for step, seconds in result.timings_s.items()},
         "stems": [
@@ -117,6 +125,10 @@ def _summary(result: Any, inventory: Any) -> dict[str, Any]:
             for row in inventory
         ],
     }
+
+
+def _percent(part: float | None, whole: float) -> float | None:
+    return None if part is None else 100 * part / whole
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

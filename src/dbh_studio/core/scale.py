@@ -37,6 +37,11 @@ class ScaleEstimate:
             raise ValueError(f"the standard error is {self.standard_error} but must be 0 or more")
 
     @property
+    def is_weak(self) -> bool:
+        """Whether it rests on what a person can only guess."""
+        return self.source in WEAK_SOURCES
+
+    @property
     def is_known(self) -> bool:
         """Whether lengths may be given in metres."""
         return self.source != "unknown"

@@ -263,20 +263,24 @@ class ScaleEvidence:
     def with_found(self, squares: Iterable[MarkerSquare]) -> ScaleEvidence:
         """With newly found markers in place of those found before; what a person marked stays.
 
-        A marker found again keeps the role and the side a person gave it.
+        A marker found again keeps the role and the side a person gave it. One that has the name of a length marked by
+        hand gets another.
         """
         before = {square.marker: square for square in self.squares if square.marker is not None}
-        found = tuple(
-            replace(square, role=old.role, side_m=old.side_m, side_se_m=old.side_se_m)
-            if square.marker is not None and (old := before.get(square.marker)) is not None
-            else square
-            for square in squares
-        )
+        # A number that stands at two places gives two squares, which only their names tell apart.
+        by_name = {square.name: square for square in before.values()} | {s.name: s for s in self.squares if s.marker}
         by_hand = tuple(square for square in self.squares if square.marker is None)
         taken = {square.name for square in by_hand} | {bar.name for bar in self.bars}
-        clash = [square.name for square in found if square.name in taken]
-        if clash:
-            raise ValueError(f"{clash[0]} is the name of a length marked by hand")
+        found = []
+        for square in squares:
+            old = by_name.get(square.name)
+            old = old if old is not None and old.marker == square.marker else before.get(square.marker)
+            if old is not None:
+                square = replace(square, role=old.role, side_m=old.side_m, side_se_m=old.side_se_m)
+            while square.name in taken:
+                square = replace(square, name=f"{square.name} (found)")
+            taken.add(square.name)
+            found.append(square)
         return replace(self, squares=(*found, *by_hand))
 
     def report(self, up_src: Float64 | None = None) -> ScaleReport:
