@@ -173,8 +173,8 @@ def test_run_as_json(las, tmp_path, capsys):
     assert main(["run", str(las), "--out", str(tmp_path), "--json", "--name", "Stand 4/b", "--scale", "1.5"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert set(result) == {
-        "plot", "csv", "project", "n_stems", "n_measured", "n_refused", "metres_per_unit", "scale_source", "notes",
-        "seconds", "stems",
+        "plot", "csv", "project", "n_stems", "n_measured", "n_refused", "metres_per_unit", "scale_source",
+        "scale_err_pct", "notes", "seconds", "stems",
     }  # fmt: skip
     assert Path(result["csv"]) == tmp_path / "Stand 4_b.csv" and Path(result["project"]).is_dir()
     assert (result["plot"], result["metres_per_unit"], result["scale_source"]) == ("Stand 4/b", 1.5, "factor")

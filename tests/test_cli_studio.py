@@ -18,6 +18,7 @@ import pytest
 from tests.threestems import plot_cloud
 
 from dbh_studio.app import commands, demo, opening
+from dbh_studio.app.cache import CACHE_VARIABLE
 from dbh_studio.cli import main
 from dbh_studio.cli import studio as studio_cli
 from dbh_studio.core.synthetic import PlotRecipe
@@ -130,7 +131,7 @@ def use_recipe(patch: pytest.MonkeyPatch, cache: Path, *, seed: int) -> None:
         name="Tiny", seed=seed, n_trees=3, n_thin=0, n_big=0, n_twins=0, n_hidden=0, n_dead=0, n_logs=0,
         side_m=10.0, points=150_000, understorey=0.0, crowns=0.2,
     )  # fmt: skip
-    patch.setenv(demo.CACHE_VARIABLE, str(cache))
+    patch.setenv(CACHE_VARIABLE, str(cache))
     patch.setattr(demo, "demo_recipe", lambda: recipe)
 
 

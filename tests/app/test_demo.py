@@ -3,15 +3,20 @@
 import csv
 import dataclasses
 import multiprocessing
+import os
+import signal
+import sys
+import time
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
-from dbh_studio.app import demo
+from dbh_studio.app import cache, demo
 from dbh_studio.core.synthetic import PlotRecipe
 from dbh_studio.errors import FileError, MalformedFileError, MissingComponentError
+from dbh_studio.io.lock import lock_file
 
 SMALL = PlotRecipe.simple(n_trees=3, points=4000, name="small")
 
@@ -105,6 +110,38 @@ def test_a_cancelled_making_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def die_half_way(cache):
+    demo.demo_plot(cache, recipe=SMALL, progress=lambda *_: os.kill(os.getpid(), signal.SIGKILL))
+
+
+def grow_old(folder, seconds):
+    for path in folder.iterdir():
+        os.utime(path, times=(time.time() - seconds,) * 2)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+def test_what_a_killed_making_left_is_cleared_away(tmp_path):
+    process = multiprocessing.get_context("spawn").Process(target=die_half_way, args=(tmp_path,))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL and len(list(tmp_path.iterdir())) == 2
+    grow_old(tmp_path, 120)
+    made = demo.demo_plot(tmp_path, recipe=SMALL)
+    assert list(tmp_path.iterdir()) == [made.path.parent]
+
+
+def test_what_others_are_making_is_left_alone(tmp_path):
+    (tmp_path / ".demo-living").mkdir()
+    (tmp_path / ".demo-unlocked").mkdir()
+    (tmp_path / ".demo-abandoned").mkdir()
+    with lock_file(tmp_path / ".demo-living.lock"):
+        grow_old(tmp_path, 3600)
+        os.utime(tmp_path / ".demo-abandoned", times=(time.time() - 3 * 86_400,) * 2)
+        made = demo.demo_plot(tmp_path, recipe=SMALL)
+        kept = {".demo-living", ".demo-living.lock", ".demo-unlocked", made.path.parent.name}
+        assert {path.name for path in tmp_path.iterdir()} == kept
+
+
 def test_cache_that_cannot_be_written_says_what_to_do(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="DBH_STUDIO_CACHE"):
@@ -112,11 +149,11 @@ def test_cache_that_cannot_be_written_says_what_to_do(tmp_path):
 
 
 def test_cache_folder_follows_argument_then_environment(tmp_path, monkeypatch):
-    monkeypatch.setenv(demo.CACHE_VARIABLE, str(tmp_path / "named"))
-    assert demo.cache_folder() == tmp_path / "named"
-    assert demo.cache_folder(tmp_path) == tmp_path
-    monkeypatch.delenv(demo.CACHE_VARIABLE)
-    assert "dbh-studio" in str(demo.cache_folder())
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "named"))
+    assert cache.cache_folder() == tmp_path / "named"
+    assert cache.cache_folder(tmp_path) == tmp_path
+    monkeypatch.delenv(cache.CACHE_VARIABLE)
+    assert "dbh-studio" in str(cache.cache_folder())
 
 
 def test_shipped_recipe_has_what_the_tour_needs():

@@ -99,6 +99,39 @@ def test_a_package_that_crashes_is_reported_and_the_doctor_goes_on(module_folder
     assert "--force-reinstall" in check.remedy
 
 
+def test_of_packages_imported_together_the_bad_ones_are_not_named_good(module_folder: Path) -> None:
+    bodies = {
+        "fine": "print('imported liar', end='')",
+        "raises": "raise ImportError('no')",
+        "leaves": "import sys; sys.exit(3)",
+        "also_fine": "",
+        "dies": "import os; os._exit(139)",
+        "after": "",
+    }
+    for name, body in bodies.items():
+        (module_folder / f"{name}.py").write_text(body, encoding="utf-8")
+    assert doctor.import_together(list(bodies)) & set(bodies) == {"fine", "also_fine"}
+    assert doctor.import_together([]) == set()
+
+
+def test_what_could_not_be_imported_together_is_tried_alone(
+    module_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, body in {"dies": "import os; os._exit(7)", "after": ""}.items():
+        (module_folder / f"{name}.py").write_text(body, encoding="utf-8")
+    monkeypatch.setattr(doctor, "COMPONENTS", tuple(Component(name, (name,), "cost") for name in ("dies", "after")))
+    monkeypatch.setattr(doctor, "check_test_parts", lambda: ())
+    checks = {check.name: check for check in doctor.check_all(port=0)}
+    assert (checks["dies"].status, checks["after"].status) == ("broken", "ok")
+    assert "code 7" in checks["dies"].detail
+
+
+def test_packages_that_hang_together_are_not_waited_for(module_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "TOGETHER_TIMEOUT_S", 1.0)
+    (module_folder / "hangs.py").write_text("import time; time.sleep(60)", encoding="utf-8")
+    assert doctor.import_together(["hangs"]) == set()
+
+
 def test_an_import_that_hangs_is_given_up(module_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "IMPORT_TIMEOUT_S", 1.0)
     check = checked(module_folder, "hangs", "import time; time.sleep(60)")
@@ -157,6 +190,22 @@ def test_a_folder_that_may_not_be_written_is_said(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(doctor.os, "access", lambda folder, mode: False)  # To root, every folder can be written.
     check = doctor.check_disk(tmp_path / "cache")
     assert check.status == "broken" and str(tmp_path) in check.remedy
+
+
+def test_the_disk_looked_at_is_that_of_the_cache_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cache").write_bytes(b"")
+    monkeypatch.setenv("DBH_STUDIO_CACHE", str(tmp_path / "cache" / "deeper"))
+    check = doctor.check_disk()
+    assert check.status == "broken" and str(tmp_path / "cache") in check.detail
+
+
+def test_a_cache_below_a_folder_that_may_not_be_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(path: Path, **_: object) -> object:
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "stat", denied)  # To root, every folder can be looked into.
+    monkeypatch.setattr(Path, "is_dir", lambda path: True)
+    assert doctor.check_disk(tmp_path / "closed" / "cache").status == "ok"
 
 
 def test_a_file_where_the_cache_should_be_is_said(tmp_path: Path) -> None:

@@ -92,3 +92,20 @@ def test_views_of_different_things_are_refused():
 def test_a_sigma_of_zero_is_a_wrong_call():
     with pytest.raises(ValueError, match="positive"):
         triangulate([[0.0, 0, 0], [1, 0, 0]], [[0, 0, 1.0], [0, 1, 1.0]], 0.0)
+
+
+@pytest.mark.parametrize("miss_rad", [0.01, 0.2])
+def test_two_views_of_different_points_are_refused(miss_rad):
+    """Two rays always have a nearest point, also where they pass each other."""
+    rays = [[1.0, miss_rad, 1.0], [-1.0, -miss_rad, 1.0]]
+    answer = triangulate([[-1.0, 0, 0], [1.0, 0, 0]], rays, 1e-3)
+    assert isinstance(answer, Refusal)
+    assert answer.code == "disagree" and "two views" in answer.reason
+
+
+def test_without_the_rejected_ray_too_little_parallax_may_be_left():
+    """The one ray from the side is far off once the others agree, and they look from nearly one direction."""
+    origins = [[0.049, -0.008, -0.054], [0.044, -0.064, -0.036], [8.0, 0.0, 0.0]]
+    rays = [[-0.055, 0.009, 10.053], [-0.042, 0.071, 10.028], [-7.986, 0.122, 10.008]]
+    answer = triangulate(origins, rays, 2e-3)
+    assert isinstance(answer, Refusal) and answer.code == "parallel"

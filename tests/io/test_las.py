@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import struct
-import subprocess
-import sys
 
 import laspy
 import numpy as np
@@ -204,15 +202,3 @@ def test_a_class_with_the_number_of_noise_that_most_points_have_is_kept(tmp_path
 def test_a_cloud_without_noise_says_nothing_of_it(tmp_path, survey_points):
     _with_classes(tmp_path / "plot.laz", survey_points, np.full(500, 2))
     assert read_las(tmp_path / "plot.laz").notes == ()
-
-
-def test_reading_leaves_the_web_client_importable(tmp_path, survey_points):
-    """It is kept from being imported with laspy, and from nothing else."""
-    path = tmp_path / "a.las"
-    write_las(path, PointCloud.from_points(survey_points))
-    code = (
-        "import sys, pathlib; from dbh_studio.io.las import read_las; read_las(pathlib.Path(sys.argv[1]));"
-        "assert 'requests' not in sys.modules; import laspy; assert laspy.copc.requests is None"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

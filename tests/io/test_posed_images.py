@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,7 @@ from dbh_studio.core.camera import CameraModel
 from dbh_studio.core.posed_images import PosedImage, PosedImages
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.errors import FileMissingError
+from dbh_studio.io.photos import open_picture
 from dbh_studio.io.posed import find_images, read_posed_images
 
 WIDTH, HEIGHT = 80, 60
@@ -176,3 +179,19 @@ def test_the_folder_said_is_the_folder_used(tmp_path):
 def test_what_is_not_there_is_said(tmp_path, name):
     with pytest.raises(FileMissingError, match="no such file"):
         read_posed_images(tmp_path / name)
+
+
+def test_a_very_large_panorama_is_a_photo(tmp_path):
+    """More than Pillow takes for an attack; only its header is read, and Pillow's own limit stays for others."""
+    limit = Image.MAX_IMAGE_PIXELS
+    width, height = 24_000, 12_000
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + struct.pack(">I", 1 << 20)
+    path = tmp_path / "large.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunks + b"IDAT" + bytes(64))
+    camera = CameraModel("EQUIRECTANGULAR", width, height, ())
+    match = find_images(PosedImages((PosedImage("large.png", camera, Similarity.identity()),)), tmp_path)
+    assert [image.path for image in match.found] == [str(path)] and match.wrong_size == {}
+    with open_picture(path) as picture:
+        assert picture.size == (width, height)
+    assert limit == Image.MAX_IMAGE_PIXELS

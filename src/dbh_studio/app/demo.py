@@ -84,6 +84,7 @@ def demo_plot(
     recipe = demo_recipe() if recipe is None else recipe
     cache = cache_folder(cache_dir)
     folder = cache / f"demo-{_fingerprint(recipe)}"
+    _clear_leftovers(cache)
     if not _is_complete(folder):
         try:
             _make(folder, recipe, progress)
@@ -113,7 +114,6 @@ def _is_complete(folder: Path) -> bool:
 def _make(folder: Path, recipe: PlotRecipe, progress: Progress) -> None:
     """Make the plot in a folder of its own and move that into place as a whole."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    _clear_leftovers(folder.parent)
     with _workshop(folder.parent) as workshop:
         plot = make_plot(recipe, progress=subprogress(progress, 0.0, 0.8))
         progress(0.8, "Saving the demo plot.")
@@ -143,7 +143,7 @@ def _workshop(cache: Path) -> Iterator[Path]:
 
 def _clear_leftovers(cache: Path) -> None:
     """Remove the workshops of processes that were killed, and no others."""
-    for path in cache.glob(f"{_WORKSHOP}*"):
+    for path in list(cache.glob(f"{_WORKSHOP}*")):
         with contextlib.suppress(OSError, ProjectLockedError):
             age_s = time.time() - path.stat().st_mtime
             if path.suffix == _LOCK and age_s > _SETTLED_S:

@@ -14,6 +14,7 @@ from dbh_studio.cli.common import (
     add_cloud_options,
     add_settings_options,
     counted,
+    finite_number,
     path_argument,
     plain,
     progress_for,
@@ -47,7 +48,7 @@ def add_commands(commands: Any) -> None:
     )
     measure.add_argument(
         "--ground-z",
-        type=float,
+        type=finite_number,
         metavar="M",
         help="height of the ground in the files, metres; 0 where z is already a height; without it the ground "
         "is each stem's own lowest point",
@@ -88,15 +89,13 @@ def measure_files(options: argparse.Namespace) -> int:
 def _row(
     path: Path, options: argparse.Namespace, settings: MeasureSettings
 ) -> tuple[dict[str, Any], StudioError | None]:
-    # A table is often opened in a spreadsheet, which would run a name that begins as a formula does.
-    name = f"./{path}" if str(path).startswith(("=", "+", "-", "@")) else str(path)
     try:
-        return {"file": name} | _measure_file(path, options, settings), None
+        return {"file": str(path)} | _measure_file(path, options, settings), None
     except UnscaledCloudError:
         error: StudioError = unscaled_error()
     except StudioError as other:
         error = other
-    return {"file": name, "reason": error.problem, "remedy": error.remedy}, error
+    return {"file": str(path), "reason": error.problem, "remedy": error.remedy}, error
 
 
 def _write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
@@ -126,10 +125,15 @@ def _write_csv(path: Path, text: str) -> None:
 
 
 def _csv(rows: list[dict[str, Any]]) -> str:
+    from dbh_studio.io.inventory_csv import defused
+
     stream = io.StringIO()
     writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    # None is written as an empty cell.
+    writer.writerows(
+        {name: defused(value) if isinstance(value, str) else value for name, value in row.items()} for row in rows
+    )
     return stream.getvalue()
 
 

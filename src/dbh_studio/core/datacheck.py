@@ -284,7 +284,10 @@ def _nearest_unit(factor: float) -> Unit:
 
 
 def _ask(unit: Unit, suggested: float | None, message: str) -> _UnitVerdict:
-    remedy = "Give a scale: say which unit it is, type metres per unit, or measure a marker or a known distance."
+    remedy = (
+        "Give a scale: say which unit it is, type metres per unit, or measure markers or a known distance (in the "
+        "studio under Scale, on the command line with `dbh-studio scale`)."
+    )
     return _UnitVerdict(unit, None, suggested, Finding("unit", "stop", message, remedy))
 
 

@@ -15,6 +15,7 @@ _MAX_PAIRS = 400
 _REJECT_SIGMA = 4.0
 _HUBER_SIGMA = 1.5
 _ITERATIONS = 30
+_ROUNDS = 5
 SMALLEST_PARALLAX_DEG = 1.0
 
 
@@ -41,7 +42,7 @@ def triangulate(origins: ArrayLike, directions: ArrayLike, sigma_rad: ArrayLike)
     """The point nearest to the rays, by angle.
 
     Pairs of rays propose points; the one most rays agree with starts a least-squares solution with Huber weights, from
-    which rays farther off than four sigmas are left out.
+    which rays farther off than four sigmas are left out; fewer than two that are not make a refusal.
 
     Args:
         origins: (N, 3) centres of the cameras, or (3,) for all.
@@ -66,18 +67,17 @@ def triangulate(origins: ArrayLike, directions: ArrayLike, sigma_rad: ArrayLike)
     inliers = _consensus(starts, rays, sigma)
     if inliers.sum() < 2:
         return _disagree(len(rays))
-    parallax_deg = parallax(rays[inliers])
-    if parallax_deg < SMALLEST_PARALLAX_DEG:
-        return Refusal(
-            "parallel",
-            f"The views look at the point from nearly one direction ({parallax_deg:.2f}° apart).",
-            "Use photos taken farther apart.",
-        )
-    for _ in range(5):
+    for _ in range(_ROUNDS):
+        parallax_deg = parallax(rays[inliers])
+        if parallax_deg < SMALLEST_PARALLAX_DEG:
+            return _parallel(parallax_deg)
         point, weights = refine_point(starts, rays, inliers / sigma**2)
         residuals = angles_to(point, starts, rays)
         kept = residuals < _REJECT_SIGMA * sigma
-        if (kept == inliers).all() or kept.sum() < 2:
+        if kept.sum() < 2:
+            # Two rays always have a nearest point. That they meet there is what makes it one.
+            return _behind() if (residuals[inliers] > np.pi / 2).any() else _disagree(len(rays))
+        if (kept == inliers).all():
             break
         inliers = kept
     if (np.einsum("ij,ij->i", point - starts[inliers], rays[inliers]) <= 0).any():
@@ -98,10 +98,18 @@ def _unusable(starts: Float64, rays: Float64) -> Refusal | None:
     return None
 
 
+def _parallel(parallax_deg: float) -> Refusal:
+    return Refusal(
+        "parallel",
+        f"The views look at the point from nearly one direction ({parallax_deg:.2f}° apart).",
+        "Use photos taken farther apart.",
+    )
+
+
 def _disagree(n: int) -> Refusal:
     return Refusal(
         "disagree",
-        f"No two of the {n} views look at the same point.",
+        f"No two of the {n} views look at the same point." if n > 2 else "The two views look at different points.",
         "Check that the same corner was marked in each photo, and that the poses belong to these photos.",
     )
 

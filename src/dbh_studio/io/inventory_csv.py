@@ -50,8 +50,13 @@ def _cell(column: str, value: Any) -> str:
         text = f"{value:.{_DECIMALS[column]}f}"
         # -0.000 is a zero that looks like a mistake.
         return text.removeprefix("-") if float(text) == 0 else text
+    return defused(str(value))
+
+
+def defused(text: str) -> str:
+    """Text for a cell of any table, with an apostrophe where a spreadsheet would begin to read a formula."""
     # A NUL ends the text for many readers; a lone carriage return is a line end to some and is not quoted by csv.
-    text = str(value).replace("\x00", "").replace("\r\n", "\n").replace("\r", "\n")
+    text = text.replace("\x00", "").replace("\r\n", "\n").replace("\r", "\n")
     return _FORMULA_START.sub("'", text)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import re
 import struct
-import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -116,21 +116,9 @@ def _check_chunk_table(path: Path, size: int, offset: int) -> None:
         raise MalformedFileError(path, f"The file claims {n_chunks:,} compressed chunks.", _AGAIN)
 
 
-def _import_laspy() -> Any:
-    """laspy, without the web client that it would read COPC over the network with: that doubles its import time."""
-    needless = "requests" not in sys.modules
-    if needless:
-        sys.modules["requests"] = None  # type: ignore[assignment]  # importing it now fails, which laspy provides for
-    try:
-        import laspy
-    finally:
-        if needless:
-            del sys.modules["requests"]
-    return laspy
-
-
 def _read(path: Path, progress: Progress, attributes: Attributes, *, keep_noise: bool = False) -> LoadedCloud:
-    laspy = _import_laspy()
+    import laspy
+
     selection = laspy.DecompressionSelection.all() if attributes == "all" else _needed_layers(laspy)
     with laspy.open(path, decompression_selection=selection) as reader:
         header = reader.header
@@ -151,7 +139,7 @@ def _read(path: Path, progress: Progress, attributes: Attributes, *, keep_noise:
         noise = _NOISE_SINCE_14 if header.point_format.id >= 6 else _NOISE
         done = n_noise = 0
         chunk = max(1, min(CHUNK_POINTS, _CHUNK_BYTES // header.point_format.size))
-        for points in reader.chunk_iterator(chunk):
+        for points in _one_ahead(reader.chunk_iterator(chunk)):
             xyz = _coordinates(points, header)
             rgb = np.stack([points.red, points.green, points.blue], axis=1) if coloured else None
             values = {name: np.asarray(points[name]) for name in dtypes}
@@ -175,6 +163,15 @@ def _read(path: Path, progress: Progress, attributes: Attributes, *, keep_noise:
         (*notes, *_noise_note(n_noise, keep_noise), *dropped),
         Provenance(kind, software, metres_per_unit, geographic),
     )
+
+
+def _one_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
+    """The same chunks; the next one is decompressed on a thread of its own while this one is worked on."""
+    with ThreadPoolExecutor(1) as pool:
+        following = pool.submit(next, chunks, None)
+        while (chunk := following.result()) is not None:
+            following = pool.submit(next, chunks, None)
+            yield chunk
 
 
 def _coordinates(points: Any, header: Any) -> Float64:

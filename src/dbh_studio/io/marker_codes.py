@@ -95,10 +95,17 @@ def marker_bits(name: str, marker_id: int) -> Bool:
 
 def smallest_dictionary(name: str, marker_id: int) -> str:
     """The smallest dictionary of the same family that has this marker: 4X4_50 and 4X4_1000 share their first fifty."""
-    for family in FAMILIES:
-        if name in family:
-            for candidate in family:
-                limit = candidate.rsplit("_", 1)[-1]
-                if candidate == name or (limit.isdigit() and marker_id < int(limit)):
-                    return candidate
+    for candidate in _family(name):
+        limit = candidate.rsplit("_", 1)[-1]
+        if candidate == name or (limit.isdigit() and marker_id < int(limit)):
+            return candidate
     return name
+
+
+def largest_dictionary(name: str) -> str:
+    """The largest dictionary of the same family."""
+    return _family(name)[-1]
+
+
+def _family(name: str) -> tuple[str, ...]:
+    return next((family for family in FAMILIES if name in family), (name,))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,8 +12,31 @@ from dbh_studio.core.arrays import UInt8
 from dbh_studio.core.posed_images import PosedImage
 from dbh_studio.errors import FileMissingError, MalformedFileError, TruncatedFileError
 
-# Pillow takes more for an attack; a 16K panorama is a third of it.
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+# A 16K panorama is a third of it. Pillow itself takes less than half of it for an attack.
 _MAX_PIXELS = 400_000_000
+_opening = threading.Lock()
+
+
+def open_picture(path: Path) -> Image:
+    """A picture of any size, of which only the header has been read; the caller closes it.
+
+    Raises:
+        OSError: It is missing, or no picture.
+        SyntaxError: It is damaged.
+        ValueError: It is damaged.
+    """
+    from PIL import Image
+
+    with _opening:
+        # Pillow asks when it opens, and it asks a variable of the whole program.
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(path)
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def read_photo(photo: PosedImage) -> UInt8:
@@ -20,14 +45,11 @@ def read_photo(photo: PosedImage) -> UInt8:
     Raises:
         FileError: The photo is missing, broken, too large, or has another shape than its camera.
     """
-    from PIL import Image
-
     if photo.path is None:
         raise FileMissingError(photo.name, "The photo was not found.", "Say in which folder the photos are.")
     path = Path(photo.path)
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        with Image.open(path) as picture:
+        with open_picture(path) as picture:
             width, height = picture.size
             if width * height > _MAX_PIXELS:
                 raise MalformedFileError(path, f"It has {width} x {height} pixels.", "Use a smaller photo.")
@@ -42,5 +64,3 @@ def read_photo(photo: PosedImage) -> UInt8:
         raise FileMissingError(path, "There is no such file.", "Say in which folder the photos are.") from None
     except (OSError, SyntaxError, ValueError) as error:
         raise TruncatedFileError(path, f"It cannot be read as an image ({error}).", "Copy the photo again.") from None
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit

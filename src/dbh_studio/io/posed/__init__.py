@@ -9,11 +9,11 @@ from pathlib import Path
 
 from dbh_studio.core.posed_images import PosedImages
 from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.errors import EmptyFileError, FileMissingError, MalformedFileError, UnsupportedFormatError
+from dbh_studio.errors import EmptyFileError, FileError, FileMissingError, MalformedFileError, UnsupportedFormatError
 from dbh_studio.io.posed import colmap, metashape, opensfm, table
 from dbh_studio.io.posed.images import ImageMatch, find_images
 
-__all__ = ["ImageMatch", "describe_posed_formats", "find_images", "read_posed_images"]
+__all__ = ["ImageMatch", "describe_posed_formats", "find_images", "holds_poses", "read_posed_images"]
 
 _SNIFF_BYTES = 1 << 16
 _MAX_DEPTH = 4
@@ -51,6 +51,15 @@ def read_posed_images(
         raise FileMissingError(path, f"It cannot be read ({error.strerror or error}).", "Check the path.") from None
     except MemoryError:
         raise MalformedFileError(path, "It needs more memory than there is.", "Is it the right file?") from None
+
+
+def holds_poses(folder: Path) -> bool:
+    """Whether a folder seems to hold a reconstruction: by names and beginnings, nothing is read."""
+    try:
+        _find_reconstruction(folder)
+    except (FileError, OSError):
+        return False
+    return True
 
 
 def _read(path: Path, progress: Progress) -> tuple[PosedImages, Path]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
 from dbh_studio.core.posed_images import PosedImage, PosedImages
 from dbh_studio.errors import FileMissingError
+from dbh_studio.io.photos import open_picture
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
 # Pictures under the same names that are not the photos.
@@ -77,7 +78,7 @@ def find_images(posed: PosedImages, folders: Path | str | Iterable[Path | str]) 
     """
     roots = [Path(folders)] if isinstance(folders, (str, Path)) else [Path(folder) for folder in folders]
     files = list_images(roots)
-    matched, renamed, ambiguous = _match(posed, roots, files)
+    matched, renamed, ambiguous = match_names([image.name for image in posed.images], roots, files)
     found: list[PosedImage] = []
     wrong: dict[str, str] = {}
     resized: dict[str, tuple[int, int]] = {}
@@ -126,16 +127,13 @@ def image_size(path: Path) -> tuple[int, int] | None:
 
     Poses belong to the pixels as stored, so whoever reads the photo must not turn it either.
     """
-    from PIL import Image
-
     try:
         with warnings.catch_warnings():
-            # Only the header is read; a large panorama is no attack.
+            # Of a photo with damaged metadata the size is good all the same.
             warnings.simplefilter("ignore")
-            with Image.open(path) as picture:
-                width, height = picture.size
-        return int(width), int(height)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            with open_picture(path) as picture:
+                return picture.size
+    except (OSError, ValueError, SyntaxError):
         return None
 
 
@@ -147,17 +145,21 @@ def _size_problem(image: PosedImage, path: Path, size: tuple[int, int]) -> str:
     return f"{sizes}: it was cropped or is another photo. Use the photos as the reconstruction had them."
 
 
-def _match(
-    posed: PosedImages, roots: list[Path], files: list[Path]
+def match_names(
+    names: Sequence[str], roots: Sequence[Path], files: Sequence[Path]
 ) -> tuple[dict[str, Path], dict[str, Path], dict[str, int]]:
-    """Name → path, those of them renamed, and how many candidates the ambiguous ones have."""
+    """Match names with ``/`` between folders to files below `roots`, in the order of `find_images`.
+
+    Returns:
+        Name → path, those of them renamed, and how many candidates the ambiguous ones have.
+    """
     matched: dict[str, Path] = {}
     renamed: dict[str, Path] = {}
     known = set(files)
-    for image in posed.images:
-        exact = [root / image.name for root in roots if root / image.name in known]
-        if exact and image.name:
-            matched[image.name] = exact[0]
+    for name in names:
+        exact = [root / name for root in roots if root / name in known]
+        if exact and name:
+            matched[name] = exact[0]
     ambiguous: dict[str, int] = {}
     for key in (_base, _base_lower, _stem_lower):
         taken = set(matched.values())
@@ -166,11 +168,11 @@ def _match(
             if path not in taken:
                 by_key[key(path.as_posix(), True)].append(path)
         wanted: dict[str, list[str]] = defaultdict(list)
-        for image in posed.images:
-            if image.name not in matched:
-                wanted[key(image.name, False)].append(image.name)
-        for value, names in wanted.items():
-            pairs = _pair(names, by_key.get(value, []))
+        for name in names:
+            if name not in matched:
+                wanted[key(name, False)].append(name)
+        for value, alike in wanted.items():
+            pairs = _pair(alike, by_key.get(value, []))
             for name, candidates in pairs.items():
                 if len(candidates) == 1:
                     matched[name] = renamed[name] = candidates[0]

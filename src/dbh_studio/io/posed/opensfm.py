@@ -76,11 +76,9 @@ def read_opensfm(path: Path, *, content: Any = None, progress: Progress = ignore
     poses = _rig_poses(part, path)
     for name, shot in _items(part, "shots", path):
         _add_shot(str(name), shot, cameras, poses, builder)
-    points, rgb, error = _points(part, path)
+    points, rgb = _points(part, path)
     progress(1.0, "cameras read")
-    return builder.build(
-        points=points, rgb=rgb, cloud_from_cameras=_odm_offset(path, builder), reprojection_error_px=error
-    )
+    return builder.build(points=points, rgb=rgb, cloud_from_cameras=_odm_offset(path, builder))
 
 
 def _items(part: dict[str, Any], key: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -175,11 +173,11 @@ def _add_shot(
     builder.add(name, camera, pose, time_s)
 
 
-def _points(part: dict[str, Any], path: Path) -> tuple[Float64 | None, UInt8 | None, float | None]:
-    """Points, colours, and the mean reprojection error where the points state it in pixels (old files)."""
+def _points(part: dict[str, Any], path: Path) -> tuple[Float64 | None, UInt8 | None]:
+    """Points and their colours."""
     points = [value for _, value in _items(part, "points", path)]
     if not points:
-        return None, None, None
+        return None, None
     try:
         xyz = np.array([value["coordinates"] for value in points], np.float64)
         rgb = np.array([value.get("color", (128, 128, 128)) for value in points], np.float64)
@@ -187,7 +185,7 @@ def _points(part: dict[str, Any], path: Path) -> tuple[Float64 | None, UInt8 | N
         raise MalformedFileError(path, "Its points are not laid out as OpenSfM does.", "Export it again.") from None
     if xyz.shape != (len(points), 3) or rgb.shape != xyz.shape:
         raise MalformedFileError(path, "A point does not have three coordinates and a colour.", "Export it again.")
-    return xyz, np.clip(np.nan_to_num(rgb), 0, 255).astype(np.uint8), None
+    return xyz, np.clip(np.nan_to_num(rgb), 0, 255).astype(np.uint8)
 
 
 def _odm_offset(path: Path, builder: PosedBuilder) -> Similarity | None:
