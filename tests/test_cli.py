@@ -28,7 +28,7 @@ from dbh_studio.io.las import write_las
 from dbh_studio.io.ply import write_ply
 from dbh_studio.io.project import ProjectWriter, read_project
 
-COMMANDS = ("open", "demo", "run", "measure", "scale", "marker", "doctor", "settings")
+COMMANDS = ("open", "demo", "run", "measure", "scale", "marker", "models", "doctor", "settings")
 DIAMETERS_CM = [100 * diameter for _, _, diameter in STEMS]
 
 

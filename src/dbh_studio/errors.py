@@ -10,6 +10,7 @@
     ├── UnscaledCloudError          lengths are in an arbitrary unit
     ├── SettingError                a setting is outside its bounds
     ├── MissingComponentError       an optional package or system library is absent
+    ├── ModelError                  a trained model is absent, cannot be fetched, or is another than it should be
     ├── ProjectError                the saved plot
     │   ├── ProjectLockedError      another process is writing it
     │   ├── ProjectExistsError      there is one already, and it may hold edits
@@ -89,6 +90,10 @@ class SettingError(StudioError):
 
 class MissingComponentError(StudioError):
     """An optional package or system library is absent."""
+
+
+class ModelError(StudioError):
+    """The files of a trained model are absent, cannot be fetched, or are not what they should be."""
 
 
 class ProjectError(StudioError):

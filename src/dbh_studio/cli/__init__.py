@@ -146,7 +146,7 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    from dbh_studio.cli import doctor, marker, measure, run, scale, studio
+    from dbh_studio.cli import doctor, marker, measure, models, run, scale, studio
 
     parser = argparse.ArgumentParser(
         prog="dbh-studio",
@@ -156,7 +156,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dbh-studio {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log what is done to standard error")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (studio, run, measure, scale, marker, doctor):
+    for module in (studio, run, measure, scale, marker, models, doctor):
         module.add_commands(commands)
     for command in commands.choices.values():
         # Also behind the command; without a default, which would undo the one in front of it.
