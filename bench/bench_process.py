@@ -65,15 +65,16 @@ def run(command: Sequence[str], *, limit_s: float, log: Path, environment: Mappi
     """Run `command`, sampling the memory of its process tree.
 
     The peak is the larger of the sampled sum and the high-water mark of the largest single process, so that a short
-    spike between two samples is not lost.
+    spike between two samples is not lost. Programs may keep what they compile of themselves, whatever the shell says:
+    else each start of a Python program would be timed compiling.
     """
     can_sample = sys.platform == "linux"
     peak, timed_out, before = 0, False, _children_usage()
+    full_environment = {**os.environ, **(environment or {})}
+    full_environment.pop("PYTHONDONTWRITEBYTECODE", None)
     with log.open("wb") as file:
         start = time.perf_counter()
-        process = subprocess.Popen(
-            list(command), stdout=file, stderr=subprocess.STDOUT, env={**os.environ, **(environment or {})}
-        )
+        process = subprocess.Popen(list(command), stdout=file, stderr=subprocess.STDOUT, env=full_environment)
         while process.poll() is None:
             if can_sample:
                 peak = max(peak, _tree_bytes(process.pid))

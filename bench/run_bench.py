@@ -31,7 +31,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent / "src")]
 
 import bench_peers  # noqa: E402
 from bench_match import Score, count, read_table, score  # noqa: E402
-from bench_plots import Plot, plots  # noqa: E402
+from bench_plots import Plot, generated_plot, plots  # noqa: E402
 from bench_process import Outcome, calibrate, run  # noqa: E402
 
 BASELINE = HERE / "baseline.json"
@@ -257,6 +257,16 @@ def arguments(given: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(given)
 
 
+def warm_up(command: Sequence[str], *, with_peers: bool, limit_s: float) -> None:
+    """Run both programs once without counting it: what they compile of themselves on a first start is kept."""
+    small = generated_plot("generated_0.3M")
+    with tempfile.TemporaryDirectory(prefix="dbh-bench-") as name:
+        print("warming up …", file=sys.stderr)
+        run_ours(small, Path(name), command, limit_s=limit_s, repeat=1)
+        if with_peers:
+            run_peer(small, Path(name) / "3dfin", limit_s=limit_s)
+
+
 def measure(options: argparse.Namespace) -> list[Row]:
     """Run everything; what is absent is skipped with a word."""
     with_peers = not options.no_peers
@@ -266,6 +276,8 @@ def measure(options: argparse.Namespace) -> list[Row]:
         print("3DFin is not set up, so nothing is compared with it; --install-peers does that.", file=sys.stderr)
         with_peers = False
     rows: list[Row] = []
+    command = program_command(options.program)
+    warm_up(command, with_peers=with_peers, limit_s=options.limit)
     for plot in plots(quick=options.quick):
         if options.only and plot.name not in options.only:
             continue
@@ -275,7 +287,6 @@ def measure(options: argparse.Namespace) -> list[Row]:
         with tempfile.TemporaryDirectory(prefix="dbh-bench-") as name:
             folder = Path(name)
             print(f"{plot.name} ({plot.note}) …", file=sys.stderr)
-            command = program_command(options.program)
             rows.append(run_ours(plot, folder, command, limit_s=options.limit, repeat=options.repeat))
             if with_peers:
                 rows += run_peer(plot, folder / "3dfin", limit_s=options.limit)

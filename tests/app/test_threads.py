@@ -1,10 +1,13 @@
-"""`map_in_threads`: the results of `map`, from two threads."""
+"""`map_in_threads`: the results of `map`, from two threads. `CallAhead`: a call begun before it is wanted."""
 
 import threading
 
+import numpy as np
 import pytest
 
-from dbh_studio.app.threads import map_in_threads
+from dbh_studio.app.threads import CallAhead, map_in_threads
+from dbh_studio.core.progress import ignore_progress
+from dbh_studio.errors import CancelledError
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 50])
@@ -42,3 +45,82 @@ def test_what_nobody_waits_for_is_not_begun():
     results.close()
     assert len(called) <= 5
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("ThreadPoolExecutor")]
+
+
+def test_a_call_made_ahead_is_made_once_and_reports_to_who_waits_for_it():
+    called, reports = [], []
+    is_wanted = threading.Event()
+
+    def total(points, factor, *, progress):
+        called.append(factor)
+        assert is_wanted.wait(30)
+        progress(0.5, "half")
+        return factor * float(points.sum())
+
+    def begin_to_wait(fraction, message=""):
+        reports.append((fraction, message))
+
+    points = np.arange(4.0)
+    ahead = CallAhead()
+    ahead.begin(total, points, 2.0)
+    threading.Timer(0.2, is_wanted.set).start()
+    assert ahead.call(total, points, 2.0, progress=begin_to_wait) == 12.0
+    assert called == [2.0] and reports == [(0.5, "half")]
+
+
+@pytest.mark.parametrize("change", ["array", "value", "function", "number"])
+def test_another_call_than_the_one_begun_is_made_anew_and_the_begun_one_stops(change):
+    stopped = threading.Event()
+
+    def endless(points, factor, *, progress):
+        try:
+            while True:
+                progress(0.0)
+        except CancelledError:
+            stopped.set()
+            raise
+
+    def total(points, factor=2.0, *, progress):
+        return factor * float(points.sum())
+
+    points = np.arange(4.0)
+    ahead = CallAhead()
+    ahead.begin(endless, points, 2.0)
+    if change == "function":
+        assert ahead.call(total, points, 2.0, progress=ignore_progress) == 12.0
+    elif change == "number":
+        assert ahead.call(total, points, progress=ignore_progress) == 12.0
+    else:
+        # An equal array is not the same: nobody compares millions of points.
+        arguments = (points.copy(), 2.0) if change == "array" else (points, 3.0)
+
+        def once(fraction, message=""):
+            raise CancelledError
+
+        with pytest.raises(CancelledError):
+            ahead.call(endless, *arguments, progress=once)
+    assert stopped.wait(30)
+
+
+def test_an_error_within_gives_the_call_up_and_its_own_error_comes_out_of_it():
+    stopped = threading.Event()
+
+    def endless(*, progress):
+        try:
+            while True:
+                progress(0.0)
+        finally:
+            stopped.set()
+
+    with pytest.raises(KeyError), CallAhead() as ahead:
+        ahead.begin(endless)
+        raise KeyError
+    assert stopped.wait(30)
+
+    def fails(*, progress):
+        raise ValueError("no points")
+
+    ahead = CallAhead()
+    ahead.begin(fails)
+    with pytest.raises(ValueError, match="no points"):
+        ahead.call(fails, progress=ignore_progress)

@@ -231,3 +231,21 @@ def test_points_in_a_row_carry_no_plane_and_that_is_said() -> None:
     ground = fit_ground(points, settings=GroundSettings(method="plane", plane_tolerance_m=0.01))
     assert np.isfinite(ground.z_at(FEET)).all()
     assert ground.notes
+
+
+@pytest.mark.parametrize("kind", ["plane", "terrain", "stem_base"])
+def test_no_ground_within_a_box_is_higher_than_its_highest(kind: str) -> None:
+    rng = np.random.default_rng(11)
+    nodes = rng.normal(100.0, 0.3, (12, 9)).astype(np.float32)
+    slope = np.array([0.4, -0.3])
+    ground = {
+        "plane": PlaneGround(np.array([*slope, 5.0])),
+        "terrain": TerrainGround(nodes, np.array([3.0, -2.0]), 0.5, slope, np.ones(nodes.shape, bool)),
+        "stem_base": StemBaseGround(rng.uniform(-5.0, 5.0, (7, 3))),
+    }[kind]
+    # Inside the grid, across its rim, and around it.
+    for lower, upper in (([4.0, -1.0], [6.0, 1.0]), ([0.0, -9.0], [5.0, 0.0]), ([-20.0, -20.0], [30.0, 25.0])):
+        within = rng.uniform(lower, upper, (4000, 2))
+        highest, seen = ground.highest_z(np.array(lower), np.array(upper)), float(ground.z_at(within).max())
+        size = float(np.subtract(upper, lower).sum())
+        assert seen <= highest <= seen + 0.5 * size + 2.0 * (kind == "terrain") + 10.0 * (kind == "stem_base")

@@ -369,7 +369,7 @@ def _read_and_begin(ahead: CallAhead, path: Path, *, progress: Progress = ignore
 
 
 def _import_stages() -> None:
-    """Import what looking at the data, finding trunks and measuring them need; what is broken is told where it is used."""
+    """Import what the next steps need; what is broken is told where it is used."""
     with suppress(Exception):
         import dbh_studio.core.datacheck
         import dbh_studio.stages.measure

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from dbh_studio.core.arrays import Float, Int32, as_points
+from dbh_studio.core.arrays import Bool, Float, Int32, as_points
 from dbh_studio.core.neighbours import N_WORKERS
 
 NOISE = -1
@@ -40,14 +40,13 @@ def dbscan(points: Float, *, distance: float, min_points: int, weights: NDArray[
     if not n:
         return np.empty(0, np.int32)
     weight = np.ones(n) if weights is None else np.asarray(weights, np.float64)
-    tree = cKDTree(points)
-    pairs = tree.query_pairs(distance, output_type="ndarray")
-    first, second = pairs[:, 0], pairs[:, 1]
+    # Neither balanced nor compact: built in half the time, and as quick to search.
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    # Halved indices at once: there may be many times more pairs than points.
+    first, second = tree.query_pairs(distance, output_type="ndarray").astype(np.int32).T
     density = weight + np.bincount(first, weight[second], n) + np.bincount(second, weight[first], n)
     is_core = density >= min_points
-    joined = is_core[first] & is_core[second]
-    graph = coo_matrix((np.ones(np.count_nonzero(joined), bool), (first[joined], second[joined])), shape=(n, n))
-    component = connected_components(graph, directed=False)[1]
+    component = _components(first, second, is_core)
     labels = np.where(is_core, component, NOISE)
     border = np.flatnonzero(~is_core)
     if is_core.any() and len(border):
@@ -58,12 +57,22 @@ def dbscan(points: Float, *, distance: float, min_points: int, weights: NDArray[
     return _in_order_of_appearance(labels)
 
 
+def _components(first: NDArray[Any], second: NDArray[Any], is_core: Bool) -> Int32:
+    """(N,) number of the connected component of every point, where pairs of core points are connected."""
+    if not is_core.all():
+        joined = is_core[first] & is_core[second]
+        first, second = first[joined], second[joined]
+    graph = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(len(is_core), len(is_core)))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+
+
 def _in_order_of_appearance(labels: NDArray[Any]) -> Int32:
     """Renumber 0, 1, … by each label's first row; `NOISE` stays."""
-    kept = labels != NOISE
-    names, first, inverse = np.unique(labels[kept], return_index=True, return_inverse=True)
-    rank = np.empty(len(names), np.int32)
-    rank[np.argsort(first)] = np.arange(len(names), dtype=np.int32)
+    kept = np.flatnonzero(labels != NOISE)
+    first = np.full(int(labels.max(initial=NOISE)) + 1, len(labels), np.int64)
+    first[labels[kept[::-1]]] = kept[::-1]  # the last assignment, of the first row, stays
+    rank = np.empty(len(first), np.int32)
+    rank[np.argsort(first, kind="stable")] = np.arange(len(first), dtype=np.int32)
     ordered = np.full(len(labels), NOISE, np.int32)
-    ordered[kept] = rank[inverse]
+    ordered[kept] = rank[labels[kept]]
     return ordered

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dbh_studio.core.arrays import Bool, Float64, as_points, readonly
 from dbh_studio.core.axis import WINDOW, StemAxis, band_m, stem_axis
-from dbh_studio.core.curves import CURVES
+from dbh_studio.core.curves import CURVE_WORDS, CURVES
 from dbh_studio.core.curves.base import contains, distance_to_outline, outline_centroid, outline_metrics
 from dbh_studio.core.quality import Quality, disagreement_of, grade, plain_flags
 from dbh_studio.core.robust import canonical_order, ransac
@@ -248,7 +248,7 @@ def _fit_curve(name: str, section: CrossSection, settings: MeasureSettings, seed
         rng=np.random.default_rng([seed, *name.encode()]),
     )
     if found is None:
-        return Refusal("no_curve", f"No closed {name} curve follows the points.", _LOOK, section)
+        return Refusal("no_curve", f"No closed {CURVE_WORDS[name]} curve follows the points.", _LOOK, section)
     outline = curve.outline(found.params) * radius + origin
     inliers = np.zeros(len(section.uv_m), bool)
     inliers[section.near_ring] = found.inliers
@@ -267,15 +267,16 @@ def _implausible(fit: CurveFit, section: CrossSection, settings: MeasureSettings
     """A refusal where a curve cannot be the stem's outline: it misses the ring, or contradicts it."""
     diameter_cm = 100.0 * fit.diameter_m(settings.definition)
     ring_cm = 200.0 * section.ring_radius_m
+    word = CURVE_WORDS[fit.curve]
     if not contains(fit.outline_uv_m, np.zeros(2)):
-        return Refusal("implausible", f"The {fit.curve} curve does not go round the ring's centre.", _LOOK, section)
+        return Refusal("implausible", f"The {word} curve does not go round the ring's centre.", _LOOK, section)
     if not 1.0 / _WORST_RATIO < diameter_cm / ring_cm < _WORST_RATIO:
-        reason = f"The {fit.curve} curve gives {diameter_cm:.1f} cm where a circle gives {ring_cm:.1f} cm."
+        reason = f"The {word} curve gives {diameter_cm:.1f} cm where a circle gives {ring_cm:.1f} cm."
         return Refusal("implausible", reason, _LOOK, section)
     # Last: only where curve and ring agree does an odd size speak of the scale.
     if not settings.min_diameter_cm <= diameter_cm <= settings.max_diameter_cm:
         limits = f"{settings.min_diameter_cm:g} to {settings.max_diameter_cm:g} cm"
-        reason = f"The {fit.curve} curve gives {diameter_cm:.1f} cm, outside {limits}."
+        reason = f"The {word} curve gives {diameter_cm:.1f} cm, outside {limits}."
         return Refusal(
             "implausible", reason, "Check the scale of the cloud; if it is right, change the limits.", section
         )

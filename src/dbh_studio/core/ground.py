@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from dbh_studio.core.arrays import Float, Float32, Float64, as_points, readonly
 from dbh_studio.core.ground_plane import fit_plane_ransac
+from dbh_studio.core.neighbours import N_WORKERS
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.terrain import fit_terrain
 from dbh_studio.settings import GroundSettings
@@ -48,6 +49,9 @@ class GroundModel(Protocol):
 
     def height_above(self, points_world: Float) -> Float:
         """(N,) height of (N, 3) points above the ground below them; the precision of the input is kept."""
+
+    def highest_z(self, lower_xy: Float64, upper_xy: Float64) -> float:
+        """A height that the ground within a box in plan does not exceed."""
 
 
 class _Surface:
@@ -93,6 +97,11 @@ class PlaneGround(_Surface):
         xy = as_points(xy_world, name="xy_world", n_columns=2)
         a, b, c = self.coefficients
         return a * xy[:, 0].astype(np.float64) + b * xy[:, 1] + c
+
+    def highest_z(self, lower_xy: Float64, upper_xy: Float64) -> float:
+        """The height of the plane at the highest corner of the box."""
+        slopes = self.coefficients[:2]
+        return float(np.maximum(slopes * lower_xy, slopes * upper_xy).sum() + self.coefficients[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +152,12 @@ class TerrainGround(_Surface):
             z += weight * (flat[node + step] * (1.0 - fy) + flat[node + (step + 1)] * fy)
         return z + beyond
 
+    def highest_z(self, lower_xy: Float64, upper_xy: Float64) -> float:
+        """The highest node, and what the slope adds to it where the box reaches beyond the grid."""
+        last_xy = self.corner_xy_m + self.cell_m * (np.array(self.z_m.shape) - 1)
+        beyond = np.maximum(np.maximum(self.corner_xy_m - lower_xy, upper_xy - last_xy), 0.0)
+        return float(self.z_m.max()) + float(np.abs(self.slope_xy) @ beyond)
+
 
 @dataclass(frozen=True, eq=False)
 class StemBaseGround(_Surface):
@@ -167,8 +182,12 @@ class StemBaseGround(_Surface):
         xy = as_points(xy_world, name="xy_world", n_columns=2)
         if len(self.bases_m) == 1:
             return np.full(len(xy), self.bases_m[0, 2])
-        nearest = cKDTree(self.bases_m[:, :2]).query(np.asarray(xy, np.float64))[1]
+        nearest = cKDTree(self.bases_m[:, :2]).query(np.asarray(xy, np.float64), workers=N_WORKERS)[1]
         return np.asarray(self.bases_m[nearest, 2], np.float64)
+
+    def highest_z(self, lower_xy: Float64, upper_xy: Float64) -> float:
+        """The highest base."""
+        return float(self.bases_m[:, 2].max())
 
 
 def fit_ground(

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from dbh_studio.core.curves import CURVE_WORDS
 from dbh_studio.core.section import CrossSection
 
 Quality = Literal["good", "fair", "poor"]
@@ -82,7 +83,7 @@ def plain_flags(
     elif section.max_gap_deg > GOOD.gap_deg:
         flags.append(f"a gap of {section.max_gap_deg:.0f}° in the ring")
     if disagreement > GOOD.disagreement:
-        said = ", ".join(f"{name} {100 * value:.1f} cm" for name, value in diameters_m.items())
+        said = ", ".join(f"{CURVE_WORDS.get(name, name)} {100 * value:.1f} cm" for name, value in diameters_m.items())
         flags.append(f"curves disagree by {100 * disagreement:.0f} %: {said}")
     if n_points < GOOD.n_points:
         flags.append(f"few points: {n_points}")

@@ -13,8 +13,11 @@ from dbh_studio.core.arrays import Bool, Float32, Float64, Int32
 N_SECTORS = 24
 _N_SAMPLE = 128
 _N_TRIALS = 96
-# Sets handled together, so that the (sets, trials, points) arrays stay within some tens of megabytes.
+# Sets handled together, so that what is computed for each of their trials or points stays within some megabytes.
 _BATCH = 400
+# Circles compared with all points of their sets together: these arrays then stay in the processor's own memory, which
+# is several times quicker than writing them out and reading them back.
+_CIRCLES_IN_CACHE = 384
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +103,11 @@ def find_rings(
 
 def _padded_samples(xy: NDArray[Any], group: NDArray[Any], rng: np.random.Generator) -> tuple[Float32, Bool, Int32]:
     """(G, P, 2) at most P random points of each set, (G, P) which are real, (G,) the sets' numbers."""
-    order = np.lexsort((rng.random(len(xy)), group))
-    names, start, count = np.unique(group[order], return_index=True, return_counts=True)
+    # One sum as the key in place of two keys: an order within the sets at random, several times quicker.
+    order = np.argsort(group + rng.random(len(xy)))
+    ranked = group[order]
+    start = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]]))
+    names, count = ranked[start], np.diff(start, append=len(ranked))
     rank = np.arange(len(xy)) - np.repeat(start, count)
     row = np.repeat(np.arange(len(names)), count)
     kept = rank < _N_SAMPLE
@@ -225,40 +231,56 @@ def _random_circles(local: Float32, real: Bool, rng: np.random.Generator) -> tup
 
 def _scores(local: Float32, real: Bool, xy: Float32, radius: Float32, tolerance: float) -> Float32:
     """(G, T) support of each circle: near points count for it, points inside count against it; -inf where unusable."""
-    usable = np.isfinite(radius)
-    safe_xy = np.where(usable[..., None], xy, np.float32(0))
-    safe_radius = np.where(usable, radius, np.float32(1)).astype(np.float32)
-    width = _width(safe_radius, tolerance).astype(np.float32)
-    dx = local[:, None, :, 0] - safe_xy[:, :, None, 0]
-    dy = local[:, None, :, 1] - safe_xy[:, :, None, 1]
-    gap = np.sqrt(dx * dx + dy * dy)
-    gap -= safe_radius[:, :, None]
-    gap /= width[:, :, None]
-    against = gap < -1.5
-    np.multiply(gap, gap, out=gap)
-    np.subtract(np.float32(1), gap, out=gap)
-    np.maximum(gap, 0, out=gap)
-    gap -= np.float32(0.7) * against
-    gap *= real[:, None, :]
-    return np.where(usable, gap.sum(axis=2), -np.inf)
+    score = np.full(radius.shape, -np.inf, np.float32)
+    group, trial = np.nonzero(np.isfinite(radius))
+    x, y = np.ascontiguousarray(local[:, :, 0]), np.ascontiguousarray(local[:, :, 1])
+    counted = real.astype(np.float32)
+    for start in range(0, len(group), _CIRCLES_IN_CACHE):
+        of, at = group[start : start + _CIRCLES_IN_CACHE], trial[start : start + _CIRCLES_IN_CACHE]
+        size = radius[of, at, None].astype(np.float32)
+        dx, dy = x[of], y[of]
+        dx -= xy[of, at, 0, None]
+        dy -= xy[of, at, 1, None]
+        dx *= dx
+        dy *= dy
+        dx += dy
+        gap = np.sqrt(dx, out=dx)
+        gap -= size
+        gap /= _width(size, tolerance).astype(np.float32)
+        against = gap < -1.5
+        np.multiply(gap, gap, out=gap)
+        np.subtract(np.float32(1), gap, out=gap)
+        np.maximum(gap, 0, out=gap)
+        gap -= np.float32(0.7) * against
+        gap *= counted[of]
+        score[of, at] = gap.sum(axis=1)
+    return score
 
 
 def _gauss_newton(
     local: Float32, real: Bool, xy: Float64, radius: Float64, tolerance: float
 ) -> tuple[Float64, Float64]:
     """One robust (biweight) step towards the geometric circle fit."""
-    offset = local - xy[:, None, :]
-    distance = np.maximum(np.hypot(offset[:, :, 0], offset[:, :, 1]), 1e-9)
+    x, y = local[:, :, 0] - xy[:, :1], local[:, :, 1] - xy[:, 1:]
+    distance = np.maximum(np.hypot(x, y), 1e-9)
     gap = distance - radius[:, None]
     with np.errstate(invalid="ignore"):
         weight = np.clip(1.0 - (gap / _width(radius, tolerance)[:, None]) ** 2, 0.0, None) ** 2
     weight = np.where(real & np.isfinite(gap), weight, 0.0)
     gap = np.where(np.isfinite(gap), gap, 0.0)
-    jacobian = np.concatenate([offset / distance[:, :, None], np.ones((*distance.shape, 1))], axis=2)
-    weighted = jacobian * weight[:, :, None]
-    normal = np.matmul(weighted.transpose(0, 2, 1), jacobian)
+    # The derivatives are the unit vectors outwards, and one. Sums of their products, one by one: for matrices this
+    # small that is quicker than multiplying them.
+    x /= distance
+    y /= distance
+    wx, wy = weight * x, weight * y
+    total = weight.sum(axis=1)
+    normal = np.empty((len(local), 3, 3))
+    for (i, j), values in {(0, 0): wx * x, (0, 1): wx * y, (1, 1): wy * y, (0, 2): wx, (1, 2): wy}.items():
+        normal[:, i, j] = normal[:, j, i] = values.sum(axis=1)
+    normal[:, 2, 2] = total
+    right = np.stack([(part * gap).sum(axis=1) for part in (wx, wy, weight)], axis=1)
     # A ridge keeps short arcs from running away.
-    normal += (0.01 * weight.sum(axis=1) + 1e-9)[:, None, None] * np.eye(3)
-    step = np.linalg.solve(normal, (weighted * gap[:, :, None]).sum(axis=1)[:, :, None])[:, :, 0]
+    normal += (0.01 * total + 1e-9)[:, None, None] * np.eye(3)
+    step = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     step = np.clip(step, -0.3 * np.nan_to_num(radius)[:, None], 0.3 * np.nan_to_num(radius)[:, None])
     return xy + step[:, :2], radius + step[:, 2]

@@ -121,7 +121,8 @@ def segment_trunks(
     points = as_points(points_world, name="points_world")
     if candidates is not None and np.shape(candidates) != (len(points),):
         raise ValueError(f"candidates have shape {np.shape(candidates)} but ({len(points)},) is needed")
-    height = _heights(points, ground, subprogress(progress, 0.0, 0.15))
+    top_m = max(settings.slab_high_m, settings.trunk_top_m)
+    height = _heights(points, ground, top_m, subprogress(progress, 0.0, 0.15))
     wanted = None if candidates is None else np.asarray(candidates, bool)
     slab, spacing = _slab(points, height, wanted, settings)
     stems = detect_stems(
@@ -158,17 +159,22 @@ def levelled(points: Float, height: Float, rows: Int64) -> Float32:
     return part
 
 
-def _heights(points: Float, ground: GroundModel, progress: Progress) -> Float32:
-    """(N,) height above ground; NaN, which is at no height, for stray points far outside the plot."""
+def _heights(points: Float, ground: GroundModel, top_m: float, progress: Progress) -> Float32:
+    """(N,) height above ground; NaN, which is at no height, for stray points far outside the plot.
+
+    Crowns are most of many clouds, and no step looks at them: what is higher than `top_m` above any ground is NaN too.
+    """
     lower, upper = _plot_box(points)
-    height = np.empty(len(points), np.float32)
+    highest_z = ground.highest_z(lower, upper) + top_m
+    height = np.full(len(points), np.nan, np.float32)
     for start in range(0, len(points), _CHUNK):
         progress(start / len(points), "Heights above ground")
         part = points[start : start + _CHUNK]
-        height[start : start + _CHUNK] = ground.height_above(part)
+        wanted = part[:, 2] <= highest_z
         for axis in range(2):
-            inside = (part[:, axis] >= lower[axis]) & (part[:, axis] <= upper[axis])
-            height[start : start + _CHUNK][~inside] = np.nan
+            wanted &= (part[:, axis] >= lower[axis]) & (part[:, axis] <= upper[axis])
+        rows = np.flatnonzero(wanted)
+        height[start + rows] = ground.height_above(part[rows])
     return height
 
 

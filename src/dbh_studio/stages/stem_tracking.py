@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64
+from dbh_studio.core.neighbours import N_WORKERS
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.core.rings import refit_rings
 from dbh_studio.settings import TrunkSettings
@@ -82,14 +83,20 @@ def _nearest_surface(
 ) -> tuple[Int32, Float64]:
     """(N,) the stem whose circle is nearest and within its band, -1 where none, and (N,) the distance to the circle."""
     n_near = min(2, len(stems))
-    near = cKDTree(centre[stems]).query(xy, k=np.arange(1, n_near + 1))[1]
+    # Nothing farther from an axis is within a band, and looking no farther is quicker.
+    lean = float(np.abs(rise).max(initial=0.0)) * float(np.hypot(*slope[stems].T).max())
+    reach = float((radius[stems] + band[stems]).max()) + lean + 1e-6
+    near = cKDTree(centre[stems], leafsize=8).query(
+        xy, k=np.arange(1, n_near + 1), distance_upper_bound=reach, workers=N_WORKERS
+    )[1]
     best, owner = np.full(len(xy), np.inf), np.full(len(xy), -1, np.int32)
     for column in range(n_near):
-        stem = stems[near[:, column]]
-        offset = xy - centre[stem] - rise[:, None] * slope[stem]
+        rows = np.flatnonzero(near[:, column] < len(stems))
+        stem = stems[near[rows, column]]
+        offset = xy[rows] - centre[stem] - rise[rows, None] * slope[stem]
         gap = np.abs(np.hypot(offset[:, 0], offset[:, 1]) - radius[stem])
-        better = (gap <= band[stem]) & (gap < best)
-        best[better], owner[better] = gap[better], stem[better]
+        better = (gap <= band[stem]) & (gap < best[rows])
+        best[rows[better]], owner[rows[better]] = gap[better], stem[better]
     return owner, best
 
 

@@ -16,4 +16,7 @@ from dbh_studio.core.curves.fourier import Fourier
 CURVES: Mapping[str, Curve] = MappingProxyType({"fourier": Fourier(), "ellipse": Ellipse(), "bspline": BSpline()})
 """Every curve with its default choices; `Curve.configured` applies the settings."""
 
-__all__ = ["CURVES", "BSpline", "Curve", "Ellipse", "Fourier"]
+CURVE_WORDS: Mapping[str, str] = MappingProxyType({"fourier": "Fourier", "ellipse": "ellipse", "bspline": "B-spline"})
+"""What each is called within a sentence."""
+
+__all__ = ["CURVES", "CURVE_WORDS", "BSpline", "Curve", "Ellipse", "Fourier"]
