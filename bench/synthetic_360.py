@@ -1,8 +1,9 @@
 """The rendered 360° plot: the whole program on an unscaled dense cloud of twelve trees, against the truth.
 
-    python bench/synthetic_360.py [--data FOLDER] [--program COMMAND] [--args OPTIONS] [--inventory FILE]
+    python bench/synthetic_360.py [--markers] [--data FOLDER] [--program COMMAND] [--args OPTIONS] [--inventory FILE]
 
-Runs `dbh-studio run dense_unscaled.ply --scale S` with the true scale and prints a Markdown table of errors per tree.
+Runs `dbh-studio run dense_unscaled.ply --scale S` with the true scale, or with --markers lets the program take the
+scale from the markers in the panoramas, and prints a Markdown table of errors per tree.
 The truth is for a tape at 1.30 m above the mean ground around the stem. Trees are matched by place. The program sets
 the plot upright in a frame of its own, so its map is first turned and moved (never scaled) onto the true one.
 """
@@ -31,12 +32,26 @@ DATA = HERE.parents[1] / "shared" / "data" / "synthetic_360"
 DEFINITIONS = {"tape": "dbh_tape_cm", "curve": "dbh_smooth_perim_cm", "area": "dbh_area_cm"}
 
 
+def scale_options(data: Path, scale: float, *, markers: bool) -> list[str]:
+    """How the program is told the scale: as a number, or where to find markers of known side."""
+    if not markers:
+        return ["--scale", f"{scale:.6g}"]
+    boards = json.loads((data / "poses_gt.json").read_text(encoding="utf-8"))["markers"]
+    given = ["--cameras", str(data / "colmap_equirectangular"), "--images", str(data / "images")]
+    for board in boards:
+        given += ["--marker", f"{board['dictionary']}:{board['id']}={board['side_m']}"]
+    for name in sorted({board["dictionary"] for board in boards}):
+        given += ["--dictionary", name]
+    return given
+
+
 def measured(data: Path, scale: float, options: argparse.Namespace) -> tuple[Table, str]:
     """The program's inventory of the cloud, and what the run took."""
     with tempfile.TemporaryDirectory(prefix="dbh-360-") as name:
         folder = Path(name)
         command = [*program_command(options.program), "run", str(data / "dense_unscaled.ply")]
-        command += ["--out", str(folder), "--scale", f"{scale:.6g}", "--json", *shlex.split(options.args)]
+        command += ["--out", str(folder), *scale_options(data, scale, markers=options.markers), "--json"]
+        command += shlex.split(options.args)
         environment = {"PYTHONPATH": os.pathsep.join([str(HERE.parent / "src"), os.environ.get("PYTHONPATH", "")])}
         outcome = run(command, limit_s=options.limit, log=folder / "log.txt", environment=environment)
         table = inventory_in(folder)
@@ -86,6 +101,7 @@ def main(given: Sequence[str] | None = None) -> int:
     """Run, print, and keep the figures in bench/results. Returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA, help="the folder with the rendered plot")
+    parser.add_argument("--markers", action="store_true", help="scale from the markers, not from the number")
     parser.add_argument("--program", help="command to run in place of dbh-studio")
     parser.add_argument("--args", default="", help="more options for `dbh-studio run`, in one string")
     parser.add_argument("--inventory", type=Path, help="compare this inventory instead of running the program")
@@ -101,7 +117,8 @@ def main(given: Sequence[str] | None = None) -> int:
         found, took = read_table(options.inventory), "not run"
     else:
         found, took = measured(options.data, scale, options)
-    text = f"`dbh-studio run dense_unscaled.ply --scale {scale:.5f}`: {took}\n\n{error_table(found, options.data)}\n"
+    how = "with markers" if options.markers else f"--scale {scale:.5f}"
+    text = f"`dbh-studio run dense_unscaled.ply` {how}: {took}\n\n{error_table(found, options.data)}\n"
     print(text)
     results = HERE / "results"
     results.mkdir(exist_ok=True)

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dbh_studio.core.arrays import Bool, Float64, readonly
 from dbh_studio.core.posed_images import PosedImages
 from dbh_studio.core.triangulation import SMALLEST_PARALLAX_DEG, linear_point, parallax, refine_point
 from dbh_studio.settings import MarkerSettings
+from dbh_studio.stages.marker_corners import PlacedCorners, place_corners
 from dbh_studio.stages.marker_detect import Detection
 
 MarkerKey = tuple[str, int]
+SightKey = tuple[str, str, int]
+"""(name of the photo, dictionary, id)."""
 
 _MAX_PAIRS = 300
 _MIN_VIEWS_OF_TWIN = 3
-# So many photos are used however far they are: fewer would hang on a single pose.
-_FEWEST_VIEWS = 6
 _SIDES = ((0, 1), (1, 2), (2, 3), (3, 0))
 _DIAGONALS = ((0, 2), (1, 3))
 
@@ -40,6 +42,9 @@ class Marker3D:
         footprint_src: Size of a photo's pixel on the marker, source units, as the photos weigh.
         parallax_deg: Largest angle between two of the views.
         front_share: Share of the views that stand before the printed side; about 0 where the poses are mirrored.
+        size_drift: Standard error of the size from what photos of like distance share, as a share; None: not known.
+        steepness: How many times more than usual far photos differ from near ones in the size they show.
+        n_lost: Sights of the same code that agree with no marker.
     """
 
     dictionary: str
@@ -53,6 +58,9 @@ class Marker3D:
     footprint_src: float
     parallax_deg: float
     front_share: float
+    size_drift: float | None = None
+    steepness: float = 1.0
+    n_lost: int = 0
 
     @property
     def key(self) -> MarkerKey:
@@ -117,15 +125,27 @@ class _Sights:
     starts: Float64
     rays: Float64
     sigma_rad: Float64
+    pixel_rad: Float64
     tolerance_rad: Float64
 
     def only(self, chosen: Bool) -> _Sights:
         kept = tuple(d for d, keep in zip(self.detections, chosen, strict=True) if keep)
-        return _Sights(kept, self.starts[chosen], self.rays[chosen], self.sigma_rad[chosen], self.tolerance_rad[chosen])
+        return _Sights(
+            kept,
+            self.starts[chosen],
+            self.rays[chosen],
+            self.sigma_rad[chosen],
+            self.pixel_rad[chosen],
+            self.tolerance_rad[chosen],
+        )
 
 
 def triangulate_markers(
-    detections: Sequence[Detection], posed: PosedImages, *, settings: MarkerSettings | None = None
+    detections: Sequence[Detection],
+    posed: PosedImages,
+    *,
+    settings: MarkerSettings | None = None,
+    left_out: Collection[SightKey] = (),
 ) -> tuple[Marker3D, ...]:
     """Markers in space from their corners in the photos; the poses stay as they are.
 
@@ -136,15 +156,18 @@ def triangulate_markers(
         detections: From `find_markers`.
         posed: The same photos.
         settings: The largest offset allowed.
+        left_out: Sights struck out by the person: (name of the photo, dictionary, id).
 
     Returns:
         Sorted by dictionary and id; a code seen from less than two places gives none.
     """
     settings = settings or MarkerSettings()
+    struck = set(left_out)
+    detections = [d for d in detections if (d.image, *d.key) not in struck]
     markers: list[Marker3D] = []
     for key in sorted({d.key for d in detections}):
         rest = _sights([d for d in detections if d.key == key], posed, settings)
-        needed = 2
+        needed, placed = 2, len(markers)
         while len(rest.detections) >= needed:
             agrees = _consensus(rest)
             if agrees.sum() < needed:
@@ -154,6 +177,7 @@ def triangulate_markers(
                 break
             markers.append(marker)
             rest, needed = rest.only(~used), _MIN_VIEWS_OF_TWIN
+        markers[placed:] = [replace(marker, n_lost=len(rest.detections)) for marker in markers[placed:]]
     return tuple(markers)
 
 
@@ -171,6 +195,7 @@ def _sights(detections: Sequence[Detection], posed: PosedImages, settings: Marke
         np.array(starts).reshape(-1, 3),
         np.array(rays).reshape(-1, 4, 3),
         sigma,
+        pixel,
         settings.max_offset_px * pixel,
     )
 
@@ -222,12 +247,19 @@ def _marker(sights: _Sights, agrees: Bool, settings: MarkerSettings) -> tuple[Ma
         corners = _corners(sights, used)
     if corners is None:
         return None, used
-    sights = replace(sights, sigma_rad=_sigma_with_poses(corners, sights, used))
-    chosen = used & _near_enough(corners, sights, used, settings.systematic_px)
-    corners = _corners(sights, chosen)
-    if corners is None or parallax(sights.rays[chosen].mean(axis=1)) < SMALLEST_PARALLAX_DEG:
+    members = np.flatnonzero(used)
+    agreeing = sights.only(used)
+    placed = place_corners(
+        agreeing.starts,
+        agreeing.rays,
+        agreeing.sigma_rad,
+        agreeing.pixel_rad,
+        corners.mean(axis=0),
+        settings.systematic_px,
+    )
+    if placed is None:
         return None, used
-    return _described(sights, chosen, used, corners), used
+    return _described(sights, members[placed.chosen], used, placed), used
 
 
 def _plausible(corners: Float64, sights: _Sights, used: Bool) -> Bool:
@@ -246,42 +278,6 @@ def _shape_offsets(corners: Float64, sights: _Sights) -> Float64:
     return np.asarray(np.sqrt(((off - off.mean(axis=1, keepdims=True)) ** 2).sum(axis=2).mean(axis=1)))
 
 
-def _sigma_with_poses(corners: Float64, sights: _Sights, used: Bool) -> Float64:
-    """(V,) standard error of a corner against the others, with what an error of the camera's place does to the size.
-
-    A camera a millimetre too near sees the marker too large by a millimetre over its distance: near photos have more
-    pixels on the marker, but suffer more from this. How far off the places are is told by how far all rays of a photo
-    miss the marker; half of that is put down to the place and half to the direction.
-    """
-    middle = corners.mean(axis=0)
-    reach = np.linalg.norm(middle - sights.starts, axis=1)
-    towards = (middle - sights.starts) / reach[:, None]
-    rays = sights.rays.mean(axis=1)
-    off = np.linalg.norm(np.cross(rays / np.linalg.norm(rays, axis=1, keepdims=True), towards), axis=1)
-    place_src = 0.5 * float(np.median((off * reach)[used]))
-    half_side = 0.5 * float(_as_sides(corners).mean())
-    return np.asarray(np.hypot(sights.sigma_rad, place_src * half_side / reach**2))
-
-
-def _near_enough(corners: Float64, sights: _Sights, used: Bool, systematic_px: float) -> Bool:
-    """(V,) the nearest photos, as many as give the smallest expected error of the size.
-
-    Every further photo takes away scatter, but its pixels cover more of the marker, and what blur leaves in its corners
-    is alike in all of them.
-    """
-    reach = np.linalg.norm(corners.mean(axis=0) - sights.starts, axis=1)
-    footprint = reach * np.array([d.pixel_rad for d in sights.detections])
-    order = np.argsort(np.where(used, footprint, np.inf))[: int(used.sum())]
-    weight = 1 / (reach[order] * sights.sigma_rad[order]) ** 2
-    total = np.cumsum(weight)
-    expected = 2 / total + (2 * systematic_px * np.cumsum(weight * footprint[order]) / total) ** 2
-    fewest = min(_FEWEST_VIEWS, len(order))
-    count = fewest + int(np.argmin(expected[fewest - 1 :]))
-    near = np.zeros(len(used), bool)
-    near[order[:count]] = True
-    return near
-
-
 def _corners(sights: _Sights, used: Bool) -> Float64 | None:
     """(4, 3) each corner from the same photos with the same weights.
 
@@ -296,50 +292,30 @@ def _corners(sights: _Sights, used: Bool) -> Float64 | None:
         return None
 
 
-def _described(sights: _Sights, used: Bool, agreeing: Bool, corners: Float64) -> Marker3D:
-    starts, detections = sights.starts, sights.detections
-    reach = np.linalg.norm(corners.mean(axis=0) - starts, axis=1)
-    pixel = np.array([d.pixel_rad for d in detections])
-    weight = used / (reach * sights.sigma_rad) ** 2
+def _described(sights: _Sights, chosen: NDArray[np.int64], agreeing: Bool, placed: PlacedCorners) -> Marker3D:
+    detections, corners = sights.detections, placed.corners
+    near = sights.only(np.isin(np.arange(len(agreeing)), chosen))
+    middle = corners.mean(axis=0)
+    footprint = np.linalg.norm(middle - sights.starts, axis=1) * sights.pixel_rad
     front = -np.cross(corners[1] - corners[0], corners[3] - corners[0])
-    before = (starts[used] - corners.mean(axis=0)) @ front > 0
-    offsets = _offsets(corners, sights)[used] / pixel[used, None]
+    offsets = _offsets(corners, near) / near.pixel_rad[:, None]
+    used = np.zeros(len(agreeing), bool)
+    used[chosen] = True
     return Marker3D(
         dictionary=detections[0].dictionary,
         marker_id=detections[0].marker_id,
-        corners_src=readonly(corners),
-        covariance=readonly(_covariance(sights, used, corners)),
-        views_used=tuple(d.image for d, u in zip(detections, used, strict=True) if u),
+        corners_src=corners,
+        covariance=placed.covariance,
+        views_used=tuple(d.image for d in near.detections),
         views_rejected=tuple(d.image for d, u in zip(detections, agreeing, strict=True) if not u),
         views_far=tuple(d.image for d, u in zip(detections, agreeing & ~used, strict=True) if u),
         residual_px=float(np.sqrt((offsets**2).mean())),
-        footprint_src=float((weight @ (reach * pixel)) / weight.sum()),
-        parallax_deg=parallax(sights.rays[used].mean(axis=1)),
-        front_share=float(before.mean()),
+        footprint_src=float(placed.weights.share @ footprint[chosen]),
+        parallax_deg=parallax(near.rays.mean(axis=1)),
+        front_share=float(((near.starts - middle) @ front > 0).mean()),
+        size_drift=placed.weights.drift,
+        steepness=placed.weights.steepness,
     )
-
-
-def _covariance(sights: _Sights, used: Bool, corners: Float64) -> Float64:
-    """(12, 12): leaving out each photo once tells what poses and photos do; the noise of the pixels comes on top."""
-    reach = np.linalg.norm(corners.mean(axis=0) - sights.starts, axis=1)
-    rays = sights.rays.mean(axis=1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    weight = used / (reach * sights.sigma_rad) ** 2
-    normal = (weight[:, None, None] * across).sum(axis=0)
-    covariance = np.kron(np.eye(4), np.linalg.inv(normal))
-    members = np.flatnonzero(used)
-    if len(members) >= 3:
-        left_out = []
-        for member in members:
-            rest = used.copy()
-            rest[member] = False
-            moved = _corners(sights, rest)
-            if moved is not None:
-                left_out.append((moved - corners).ravel())
-        spread = np.array(left_out)
-        covariance += (len(members) - 1) / len(members) * spread.T @ spread
-    return np.asarray(covariance)
 
 
 def frame_from_marker(marker: Marker3D) -> tuple[Float64, Float64, Float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -20,6 +21,9 @@ _TILE_OVERSAMPLING = 1.4
 _TILE_ROWS = ((90.0, 1), (45.0, 6), (0.0, 8), (-45.0, 6), (-90.0, 1))
 # Wider photos bend straight lines too much for the detector.
 _WIDEST_PLAIN_DEG = 55.0
+
+# What `cv2.remap` needs, and the share of the view the photo covers.
+_Maps = tuple[NDArray[Any], NDArray[Any], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +45,7 @@ class View:
         plane = (pixels - self.size_px / 2) / self.focal_px
         return np.asarray(np.column_stack([plane, np.ones(len(plane))]) @ self.rotation)
 
-    def maps(self, camera: CameraModel) -> tuple[NDArray[Any], NDArray[Any], float]:
+    def maps(self, camera: CameraModel) -> _Maps:
         """What `cv2.remap` needs, and the share of the view the photo covers."""
         columns, rows = np.meshgrid(np.arange(self.size_px), np.arange(self.size_px))
         uv, is_seen = camera.project(self.rays(np.column_stack([columns.ravel(), rows.ravel()]) + 0.5))
@@ -54,7 +58,7 @@ class View:
         return remap(picture, self.maps(camera), camera)
 
 
-def remap(picture: UInt8, maps: tuple[NDArray[Any], NDArray[Any], float], camera: CameraModel) -> UInt8:
+def remap(picture: UInt8, maps: _Maps, camera: CameraModel) -> UInt8:
     """A view by its maps."""
     cv2 = opencv()
     border = cv2.BORDER_WRAP if camera.is_panorama else cv2.BORDER_CONSTANT
@@ -89,23 +93,30 @@ def needs_tiles(camera: CameraModel) -> bool:
     return not bool((rays[:, 2] > np.cos(np.radians(_WIDEST_PLAIN_DEG))).all())
 
 
-@lru_cache(maxsize=2)
-def _tile_maps(
-    kind: str, width_px: int, height_px: int, params: tuple[float, ...]
-) -> tuple[tuple[View, tuple[NDArray[Any], NDArray[Any], float]], ...]:
-    camera = CameraModel(kind, width_px, height_px, params)
+@lru_cache(maxsize=1)
+def _tile_maps(camera_key: tuple[str, int, int, tuple[float, ...]]) -> tuple[tuple[int, View, _Maps], ...]:
+    """How many columns to turn the picture by, the view, and its maps.
+
+    The tiles of a row of a panorama differ by a turn only and share their maps: these are far larger than the picture.
+    """
+    camera = CameraModel(*camera_key)
     per_radian = 1.0 / _finest_angle(camera)
     half = np.radians(_TILE_FOV_DEG / 2)
     size = int(2 * np.tan(half) * per_radian * _TILE_OVERSAMPLING / 8) * 8
     tiles = []
     for pitch_deg, count in _TILE_ROWS:
-        for yaw in np.arange(count) * 2 * np.pi / count:
+        shared: _Maps | None = None
+        for number in range(count):
+            columns = round(number * camera.width_px / count)
+            yaw = 2 * np.pi * (columns / camera.width_px if camera.is_panorama else number / count)
             level = np.cos(np.radians(pitch_deg))
             direction = np.array([level * np.sin(yaw), -np.sin(np.radians(pitch_deg)), level * np.cos(yaw)])
             view = View(view_rotation(direction), size, size / (2 * np.tan(half)))
-            maps = view.maps(camera)
+            maps = view.maps(camera) if shared is None else shared
+            if camera.is_panorama:
+                shared = maps
             if maps[2] > 0.1:
-                tiles.append((view, maps))
+                tiles.append((columns if camera.is_panorama else 0, view, maps))
     return tuple(tiles)
 
 
@@ -116,7 +127,8 @@ def _finest_angle(camera: CameraModel) -> float:
     return pixel_angle(camera, middle)
 
 
-def tiles_of(picture: UInt8, camera: CameraModel) -> list[tuple[View, UInt8]]:
+def tiles_of(picture: UInt8, camera: CameraModel) -> Iterator[tuple[View, UInt8]]:
     """Straight views that cover a wide photo, with overlap, the poles and the seam of a panorama included."""
-    tiles = _tile_maps(camera.kind, camera.width_px, camera.height_px, camera.params)
-    return [(view, remap(picture, maps, camera)) for view, maps in tiles]
+    for columns, view, maps in _tile_maps((camera.kind, camera.width_px, camera.height_px, camera.params)):
+        turned = np.roll(picture, -columns, axis=1) if columns else picture
+        yield view, remap(turned, maps, camera)

@@ -7,19 +7,23 @@ report = scale_from_markers(markers, {("DICT_4X4_50", 7): 1.0})
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dbh_studio.core.arrays import UInt8
-from dbh_studio.core.bars import ScaleReport
+from dbh_studio.core.bars import ScaleReport, refused_scale
+from dbh_studio.core.dbh import Refusal
 from dbh_studio.core.posed_images import PosedImage, PosedImages
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.errors import FileError
+from dbh_studio.io.marker_codes import largest_dictionary
 from dbh_studio.settings import MarkerSettings
+from dbh_studio.stages.marker_crops import detection_crop
 from dbh_studio.stages.marker_detect import Detection, Detector, all_dictionaries, detect_in_photo
-from dbh_studio.stages.marker_geometry import Marker3D, MarkerKey, frame_from_marker, triangulate_markers
+from dbh_studio.stages.marker_geometry import Marker3D, MarkerKey, SightKey, frame_from_marker, triangulate_markers
 from dbh_studio.stages.marker_scale import check_marker, scale_from_markers
 
 __all__ = [
@@ -28,10 +32,13 @@ __all__ = [
     "MarkerKey",
     "MarkerScale",
     "ReadImage",
+    "SightKey",
     "check_marker",
+    "detection_crop",
     "find_markers",
     "frame_from_marker",
     "measure_scale",
+    "scale_from_detections",
     "scale_from_markers",
     "triangulate_markers",
 ]
@@ -40,6 +47,7 @@ ReadImage = Callable[[PosedImage], UInt8]
 """(H, W, 3) uint8 RGB of a photo; may be smaller than the camera says."""
 
 _N_SURVEY = 12
+_N_LAST_LOOK = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +74,8 @@ def find_markers(
 ) -> tuple[Detection, ...]:
     """Every marker in every photo.
 
-    Where no dictionary is named, a dozen photos are searched for all of them first, and the rest for those seen.
+    Where no dictionary is named, a dozen photos are searched for all of them first, and the rest for those seen and for
+    the numbers of their families that were not.
 
     Args:
         posed: The photos.
@@ -87,7 +96,9 @@ def find_markers(
     first = [photos[i] for i in np.unique(np.linspace(0, len(photos) - 1, min(len(photos), _N_SURVEY)).astype(int))]
     share = len(first) / max(len(photos), 1)
     found = _search(first, everything, settings, read_image, subprogress(progress, 0.0, share))
-    seen = sorted({detection.dictionary for detection in found})
+    # The small dictionaries too: the fewer codes, the more damage to one is made good.
+    small = {detection.dictionary for detection in found}
+    seen = sorted(small | {largest_dictionary(name) for name in small})
     others = [photo for photo in photos if photo not in first]
     detector = Detector(seen, settings.ids) if seen else everything
     found += _search(others, detector, settings, read_image, subprogress(progress, share, 1.0))
@@ -113,10 +124,43 @@ def _search(
             unread.append(error)
             continue
         found += detect_in_photo(photo, picture, detector, settings)
+        # Not two decoded panoramas at a time.
+        del picture
     if unread and len(unread) == len(photos):
         raise unread[0]
     progress(1.0, f"{len(found)} sights of markers")
     return found
+
+
+def scale_from_detections(
+    detections: Sequence[Detection],
+    posed: PosedImages,
+    sides_m: Mapping[MarkerKey, float] | None = None,
+    *,
+    settings: MarkerSettings | None = None,
+    left_out: Collection[SightKey] = (),
+    only_named: bool = False,
+) -> MarkerScale:
+    """Place and scale again without looking at the photos: after a side was corrected or a sight struck out.
+
+    Args:
+        detections: From `find_markers`.
+        posed: The same photos.
+        sides_m: Side of the black square per (dictionary, id); the others have `settings.side_m`.
+        settings: As for `triangulate_markers` and `scale_from_markers`.
+        left_out: Sights struck out by the person: (name of the photo, dictionary, id).
+        only_named: Whether markers without a side of their own in `sides_m` are ignored.
+    """
+    settings = settings or MarkerSettings()
+    struck = set(left_out)
+    kept = [detection for detection in detections if (detection.image, *detection.key) not in struck]
+    markers = triangulate_markers(kept, posed, settings=settings)
+    sights = Counter(detection.key for detection in kept)
+    unplaced = sorted(set(sights) - {marker.key for marker in markers})
+    report = scale_from_markers(
+        markers, sides_m, settings=settings, seen_once=unplaced, sights=sights, only_named=only_named
+    )
+    return MarkerScale(report, markers, tuple(detections))
 
 
 def measure_scale(
@@ -126,12 +170,53 @@ def measure_scale(
     settings: MarkerSettings | None = None,
     read_image: ReadImage,
     progress: Progress = ignore_progress,
+    left_out: Collection[SightKey] = (),
 ) -> MarkerScale:
-    """All three steps; see `find_markers`, `triangulate_markers` and `scale_from_markers`."""
+    """All three steps; see `find_markers` and `scale_from_detections`.
+
+    Where nothing is found, a few photos are looked at again for what may be wrong: other dictionaries, mirrored photos.
+    """
     settings = settings or MarkerSettings()
-    detections = find_markers(posed, settings=settings, read_image=read_image, progress=progress)
-    markers = triangulate_markers(detections, posed, settings=settings)
-    placed = {marker.key for marker in markers}
-    seen_once = sorted({detection.key for detection in detections} - placed)
-    report = scale_from_markers(markers, sides_m, settings=settings, seen_once=seen_once)
-    return MarkerScale(report, markers, detections)
+    detections = find_markers(
+        posed,
+        settings=settings,
+        read_image=read_image,
+        progress=subprogress(progress, 0.0, 0.95 if len(posed) else 1.0),
+    )
+    if not detections and len(posed):
+        why = _why_none(posed, settings, read_image, subprogress(progress, 0.95, 1.0))
+        if why is not None:
+            return MarkerScale(refused_scale(why.code, why.reason, why.remedy), (), ())
+    progress(1.0, f"{len(detections)} sights of markers")
+    return scale_from_detections(detections, posed, sides_m, settings=settings, left_out=left_out)
+
+
+def _why_none(
+    posed: PosedImages, settings: MarkerSettings, read_image: ReadImage, progress: Progress
+) -> Refusal | None:
+    """What a few photos show where the search found nothing."""
+    everything = Detector(all_dictionaries())
+    photos = list(posed.images)
+    some = [photos[i] for i in np.unique(np.linspace(0, len(photos) - 1, min(len(photos), _N_LAST_LOOK)).astype(int))]
+    for number, photo in enumerate(some):
+        progress(number / len(some), "looking for other and for mirrored markers")
+        try:
+            picture = read_image(photo)
+        except FileError:
+            continue
+        if settings.dictionaries or settings.ids:
+            others = detect_in_photo(photo, picture, everything, settings)
+            if others:
+                return Refusal(
+                    "other_markers",
+                    f"Photo {photo.name} shows {others[0].dictionary} {others[0].marker_id}, which was not looked for.",
+                    "Choose its dictionary and number, or leave both open.",
+                )
+        mirrored = np.ascontiguousarray(picture[:, ::-1])
+        if detect_in_photo(photo, mirrored, everything, settings):
+            return Refusal(
+                "mirrored_photos",
+                f"Photo {photo.name} shows a marker mirrored.",
+                "The photos, or the printed marker, are mirrored: export the photos again as they were taken.",
+            )
+    return None

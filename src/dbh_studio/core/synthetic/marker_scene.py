@@ -10,14 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy import fft, ndimage
+from numpy.typing import NDArray
+from scipy import ndimage
 
 from dbh_studio.core.arrays import Bool, Float, Float64, UInt8, readonly
+from dbh_studio.core.synthetic.picture_flaws import PictureFlaws, jpeg_luminance, through_the_camera
 
 _TEXTURE_PX = 1024
 _SKY = 0.85
+_THIN_M = 0.06
 
 RaysOfPixels = Callable[[Float64], Float64]
 
@@ -54,6 +58,27 @@ class MarkerBoard:
 
 
 @dataclass(frozen=True, eq=False)
+class WrappedMarker:
+    """A printed marker bent round an upright stem.
+
+    Attributes:
+        bits: (n, n) True where white, the black border included.
+        side_m: Its side while flat.
+        stem: Index of the stem.
+        azimuth_rad: Direction its middle faces, from +x towards +y.
+        height_m: z of its middle.
+        margin: White rim, as a share of `side_m`.
+    """
+
+    bits: Bool
+    side_m: float
+    stem: int
+    azimuth_rad: float
+    height_m: float
+    margin: float = 0.12
+
+
+@dataclass(frozen=True, eq=False)
 class MarkerScene:
     """The plot.
 
@@ -62,37 +87,18 @@ class MarkerScene:
         stems_m: (K, 3) x, y and radius of upright stems.
         slope: (2,) rise of the ground per metre along x and y; it passes through the origin.
         texture: (T, T) float32 tile in 0..1 for ground and bark.
+        wrapped: Markers bent round stems.
     """
 
     boards: tuple[MarkerBoard, ...]
     stems_m: Float64
     slope: Float64
     texture: Float
+    wrapped: tuple[WrappedMarker, ...] = ()
 
     def ground_m(self, x_m: Float64, y_m: Float64) -> Float64:
         """Height of the ground."""
         return np.asarray(x_m * self.slope[0] + y_m * self.slope[1])
-
-
-@dataclass(frozen=True)
-class PictureFlaws:
-    """What the way from the lens to the file does to a picture.
-
-    Attributes:
-        blur_px: Sigma of the lens, in pixels, applied to linear light.
-        linear_light: Whether the blur acts before the response curve (a camera) or after it (a resampled picture).
-        resampling_px: Sub-pixel shift that is interpolated back, as stitching does.
-        sharpening: Share of the unsharp mask.
-        noise: Sigma in grey levels of 255.
-        jpeg_quality: 1-100; 0 leaves JPEG out.
-    """
-
-    blur_px: float = 0.6
-    linear_light: bool = True
-    resampling_px: tuple[float, float] = (0.3, 0.4)
-    sharpening: float = 0.0
-    noise: float = 2.0
-    jpeg_quality: int = 90
 
 
 def noise_texture(rng: np.random.Generator, size_px: int = _TEXTURE_PX) -> Float:
@@ -104,12 +110,15 @@ def noise_texture(rng: np.random.Generator, size_px: int = _TEXTURE_PX) -> Float
     return np.asarray(np.clip(0.5 + 0.18 * total, 0.0, 1.0), np.float32)
 
 
-def random_scene(seed: int, codes: Sequence[tuple[tuple[str, int], Bool, float]]) -> MarkerScene:
+def random_scene(
+    seed: int, codes: Sequence[tuple[tuple[str, int], Bool, float]], *, hidden: bool = False
+) -> MarkerScene:
     """A plot with the given markers: the first, third … lie on the ground, the others stand upright.
 
     Args:
         seed: Development uses seeds below 1000, the published figures those from 10 000 on.
         codes: Per marker its (dictionary, id), its (n, n) bits with border, and its side in metres.
+        hidden: Whether saplings stand on and before the markers.
     """
     rng = np.random.default_rng([seed, 1])
     slope = rng.uniform(-0.12, 0.12, 2)
@@ -127,7 +136,21 @@ def random_scene(seed: int, codes: Sequence[tuple[tuple[str, int], Bool, float]]
     away = rng.uniform(4.0, 11.0, n_stems)
     turn = rng.uniform(0, 2 * np.pi) + np.arange(n_stems) * 2 * np.pi / n_stems
     stems = np.column_stack([away * np.cos(turn), away * np.sin(turn), rng.uniform(0.08, 0.3, n_stems)])
+    if hidden:
+        stems = np.vstack([stems, *(_saplings(rng, board) for board in boards)])
     return MarkerScene(tuple(boards), stems, slope, noise_texture(rng))
+
+
+def _saplings(rng: np.random.Generator, board: MarkerBoard) -> Float64:
+    """(2, 3) one on the marker or close before it, one farther out; each hides a strip of it from some sides."""
+    front = np.cross(board.down, board.right)
+    lies = abs(front[2]) > 0.7
+    spots = []
+    for nearest, farthest in ((0.1, 0.45), (0.4, 1.0)):
+        away = rng.uniform(nearest, farthest) * board.side_m
+        turn = rng.uniform(0, 2 * np.pi) if lies else np.arctan2(front[1], front[0]) + rng.uniform(-0.9, 0.9)
+        spots.append([away * np.cos(turn), away * np.sin(turn), rng.uniform(0.006, 0.02)])
+    return np.array(spots) + np.append(board.centre_m[:2], 0.0)
 
 
 def _board(
@@ -163,19 +186,6 @@ def _board(
     )
 
 
-def random_flaws(seed: int) -> PictureFlaws:
-    """One camera's flaws, drawn from what consumer 360° cameras do."""
-    rng = np.random.default_rng([seed, 2])
-    return PictureFlaws(
-        blur_px=rng.uniform(0.3, 0.9),
-        linear_light=bool(rng.random() < 0.5),
-        resampling_px=(rng.uniform(0, 0.5), rng.uniform(0, 0.5)),
-        sharpening=float(rng.choice([0.0, 0.3])),
-        noise=rng.uniform(1.0, 4.0),
-        jpeg_quality=int(rng.integers(80, 96)),
-    )
-
-
 def render(
     scene: MarkerScene,
     rays_world: RaysOfPixels,
@@ -185,6 +195,7 @@ def render(
     *,
     wraps: bool,
     seed: int = 0,
+    background_step: int = 1,
 ) -> UInt8:
     """(H, W, 3) uint8 picture of the scene.
 
@@ -196,14 +207,17 @@ def render(
         flaws: What happens on the way to the file.
         wraps: Whether the left and the right border meet (a panorama).
         seed: Of the noise.
+        background_step: So many pixels across share one ray where there is no marker: saves time in large pictures.
     """
     width, height = size_px
     shift = np.array(flaws.resampling_px)
-    rows, columns = np.indices((height, width)).reshape(2, -1)
-    pixels = np.column_stack([columns, rows]) + 0.5 + shift
+    rows, columns = np.indices((height // background_step, width // background_step)).reshape(2, -1)
+    pixels = background_step * (np.column_stack([columns, rows]) + 0.5) + shift
     light, is_board = _trace(scene, rays_world(pixels), origin_m)
-    _supersample(scene, rays_world, origin_m, pixels, light, is_board)
-    picture = _through_the_camera(light.reshape(height, width), flaws, wraps=wraps)
+    light = _enlarged(light.reshape(height // background_step, -1), background_step)
+    is_board = _enlarged(is_board.reshape(height // background_step, -1), background_step)
+    _supersample(scene, rays_world, origin_m, shift, light, is_board)
+    picture = through_the_camera(light, flaws, wraps=wraps)
     noise = np.random.default_rng([seed, 3]).standard_normal(picture.shape, dtype=np.float32)
     picture = np.clip(np.round(255 * picture + flaws.noise * noise), 0, 255)
     if flaws.jpeg_quality:
@@ -212,25 +226,30 @@ def render(
     return np.repeat(grey[:, :, None], 3, axis=2)
 
 
+def _enlarged(values: NDArray[Any], step: int) -> NDArray[Any]:
+    return values.repeat(step, axis=0).repeat(step, axis=1) if step > 1 else values
+
+
 def _supersample(
     scene: MarkerScene,
     rays_world: RaysOfPixels,
     origin_m: Float64,
-    pixels: Float64,
+    shift_px: Float64,
     light: Float,
     is_board: Bool,
     per_side: int = 4,
 ) -> None:
     """Average several rays in the pixels on and beside a marker: there the edges are what is measured."""
-    chosen = np.flatnonzero(is_board)
-    if not len(chosen):
+    rows, columns = np.nonzero(is_board)
+    if not len(rows):
         return
-    total = np.zeros(len(chosen), np.float32)
+    pixels = np.column_stack([columns, rows]) + 0.5 + shift_px
+    total = np.zeros(len(rows), np.float32)
     steps = (np.arange(per_side) + 0.5) / per_side - 0.5
     for dx in steps:
         for dy in steps:
-            total += _trace(scene, rays_world(pixels[chosen] + (dx, dy)), origin_m)[0]
-    light[chosen] = total / per_side**2
+            total += _trace(scene, rays_world(pixels + (dx, dy)), origin_m)[0]
+    light[rows, columns] = total / per_side**2
 
 
 def _lookup(texture: Float, a_m: Float, b_m: Float, px_per_m: float) -> Float:
@@ -252,16 +271,16 @@ def _trace(scene: MarkerScene, directions: Float, origin_m: Float64) -> tuple[Fl
     spots = origin[:2] + reach[:, None] * rays[low, :2]
     light[low] = 0.05 + 0.4 * _lookup(scene.texture, spots[:, 0], spots[:, 1], 90.0)
     depth[low] = reach
-    _paint_stems(scene, rays, origin, light, depth)
     is_board = np.zeros(len(rays), bool)
+    _paint_stems(scene, rays, origin, light, depth, is_board)
     for board in scene.boards:
         _paint_board(board, rays, origin_m, light, depth, is_board)
     return light, is_board
 
 
-def _paint_stems(scene: MarkerScene, rays: Float, origin: Float, light: Float, depth: Float) -> None:
+def _paint_stems(scene: MarkerScene, rays: Float, origin: Float, light: Float, depth: Float, is_board: Bool) -> None:
     level = np.hypot(rays[:, 0], rays[:, 1])
-    for x, y, radius in scene.stems_m.astype(np.float32):
+    for number, (x, y, radius) in enumerate(scene.stems_m.astype(np.float32)):
         dx, dy = x - origin[0], y - origin[1]
         along = rays[:, 0] * dx + rays[:, 1] * dy
         miss = np.abs(rays[:, 0] * dy - rays[:, 1] * dx)
@@ -271,9 +290,44 @@ def _paint_stems(scene: MarkerScene, rays: Float, origin: Float, light: Float, d
         near = (reach > 0) & (reach < depth[hit])
         hit, reach = hit[near], reach[near]
         spots = origin + reach[:, None] * rays[hit]
-        angle = np.arctan2(spots[:, 1] - y, spots[:, 0] - x) * radius
-        light[hit] = 0.04 + 0.25 * _lookup(scene.texture, angle * 2, spots[:, 2], 120.0)
+        azimuth = np.arctan2(spots[:, 1] - y, spots[:, 0] - x)
+        light[hit] = 0.04 + 0.25 * _lookup(scene.texture, azimuth * radius * 2, spots[:, 2], 120.0)
         depth[hit] = reach
+        for sheet in scene.wrapped:
+            if sheet.stem == number:
+                _paint_sheet(sheet, hit, azimuth, spots[:, 2], float(radius), light, is_board)
+        if radius < _THIN_M:
+            # Its edge may lie on a marker.
+            is_board[hit] = True
+
+
+def _paint_sheet(
+    sheet: WrappedMarker,
+    hit: NDArray[np.int64],
+    azimuth: Float,
+    height: Float,
+    radius_m: float,
+    light: Float,
+    is_board: Bool,
+) -> None:
+    away = (azimuth - sheet.azimuth_rad + np.pi) % (2 * np.pi) - np.pi
+    # Seen from outside, growing azimuth goes to the right.
+    across = away * radius_m / sheet.side_m + 0.5
+    along = (sheet.height_m - height) / sheet.side_m + 0.5
+    rim = sheet.margin
+    on = (across > -rim) & (across < 1 + rim) & (along > -rim) & (along < 1 + rim)
+    light[hit[on]] = np.where(_is_white(sheet.bits, across[on], along[on]), 0.8, 0.05)
+    is_board[hit[on]] = True
+
+
+def _is_white(bits: Bool, across: Float, along: Float) -> Bool:
+    """The print at places given as shares of the side; its rim is white."""
+    count = bits.shape[0]
+    rows, columns = np.floor(along * count).astype(int), np.floor(across * count).astype(int)
+    inside = (rows >= 0) & (rows < count) & (columns >= 0) & (columns < count)
+    white = ~inside
+    white[inside] = bits[rows[inside], columns[inside]]
+    return white
 
 
 def _paint_board(
@@ -306,11 +360,7 @@ def _paint_board(
     on = close & (across > -rim) & (across < 1 + rim) & (along > -rim) & (along < 1 + rim)
     on &= reach < depth[meets]
     hit, across, along = meets[on], across[on], along[on]
-    count = board.bits.shape[0]
-    rows, columns = np.floor(along * count).astype(int), np.floor(across * count).astype(int)
-    inside = (rows >= 0) & (rows < count) & (columns >= 0) & (columns < count)
-    white = ~inside
-    white[inside] = board.bits[rows[inside], columns[inside]]
+    white = _is_white(board.bits, across, along)
     if height < 0:
         # Its back.
         light[hit] = 0.3
@@ -318,54 +368,3 @@ def _paint_board(
         # Light never falls quite evenly on a sheet.
         light[hit] = np.where(white, board.shade, 0.05) * (0.9 + 0.2 * across)
     depth[hit] = reach[on]
-
-
-def _through_the_camera(light: Float, flaws: PictureFlaws, *, wraps: bool) -> Float:
-    """Blur, interpolation, response curve and sharpening."""
-    modes = ("nearest", "wrap" if wraps else "nearest")
-
-    def blur(picture: Float, sigma: float) -> Float:
-        return np.asarray(ndimage.gaussian_filter(picture, sigma, mode=modes, truncate=3.0))
-
-    def respond(picture: Float) -> Float:
-        return np.asarray(np.clip(picture, 0, 1) ** np.float32(1 / 2.2))
-
-    picture = respond(blur(light, flaws.blur_px)) if flaws.linear_light else blur(respond(light), flaws.blur_px)
-    for axis, part in ((1, flaws.resampling_px[0]), (0, flaws.resampling_px[1])):
-        # What stands at pixel i was seen at i + part; linear interpolation puts it back.
-        before = np.roll(picture, 1, axis)
-        if not (wraps and axis == 1):
-            edge = (slice(None), slice(0, 1)) if axis == 1 else (slice(0, 1), slice(None))
-            before[edge] = picture[edge]
-        picture = (1 - part) * picture + part * before
-    if flaws.sharpening:
-        picture = picture + flaws.sharpening * (picture - blur(picture, 1.0))
-    return picture
-
-
-_JPEG_TABLE = np.array(
-    [
-        [16, 11, 10, 16, 24, 40, 51, 61],
-        [12, 12, 14, 19, 26, 58, 60, 55],
-        [14, 13, 16, 24, 40, 57, 69, 56],
-        [14, 17, 22, 29, 51, 87, 80, 62],
-        [18, 22, 37, 56, 68, 109, 103, 77],
-        [24, 35, 55, 64, 81, 104, 113, 92],
-        [49, 64, 78, 87, 103, 121, 120, 101],
-        [72, 92, 95, 98, 112, 100, 103, 99],
-    ],
-    np.float32,
-)
-
-
-def jpeg_luminance(picture: Float, quality: int) -> Float:
-    """What baseline JPEG (ITU T.81, annex K table) leaves of (H, W) grey levels 0-255; sides are multiples of 8."""
-    height, width = picture.shape
-    if height % 8 or width % 8:
-        raise ValueError(f"the picture is {width} x {height} but multiples of 8 are needed")
-    factor = 5000 / quality if quality < 50 else 200 - 2 * quality
-    table = np.clip(np.floor((_JPEG_TABLE * factor + 50) / 100), 1, 255)
-    blocks = np.asarray(picture, np.float32).reshape(height // 8, 8, width // 8, 8).transpose(0, 2, 1, 3) - 128
-    coefficients = np.round(fft.dctn(blocks, axes=(2, 3), norm="ortho") / table) * table
-    back = fft.idctn(coefficients, axes=(2, 3), norm="ortho") + 128
-    return np.clip(np.round(back.transpose(0, 2, 1, 3).reshape(height, width)), 0, 255)
