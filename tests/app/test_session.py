@@ -15,7 +15,7 @@ from dbh_studio.app.commands import Command
 from dbh_studio.app.session import Session
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import TrunkSet
-from dbh_studio.errors import CommandError, StaleResultError, UnscaledCloudError
+from dbh_studio.errors import CommandError, SettingError, StaleResultError, UnscaledCloudError
 
 FEET = ScaleEstimate(0.3048, "feet")
 
@@ -52,6 +52,51 @@ def test_a_refused_or_empty_command_leaves_no_trace():
         session.do(commands.delete_trunk(99))
     session.do(commands.rename_plot("plot"))
     assert not session.can_undo and heard == []
+
+
+@pytest.mark.parametrize("metres_per_unit", [1e-9, 9.9e-7, 1.1e4, 1e300])
+def test_a_scale_beyond_reason_is_refused_wherever_it_comes_from(metres_per_unit):
+    session, _ = make_session()
+    before = session.document
+    with pytest.raises(SettingError, match="beyond reason"):
+        session.do(commands.set_scale(ScaleEstimate(metres_per_unit, "factor")))
+    assert session.document is before and not session.can_undo
+    for least_or_most in (1e-6, 1e4):
+        session.do(commands.set_scale(ScaleEstimate(least_or_most, "factor")))
+
+
+def test_degrees_are_given_no_scale_but_everything_else_may_be_done():
+    cloud = make_cloud()
+    session = Session(cloud, make_document(cloud), is_geographic=True)
+    before = session.document
+    with pytest.raises(SettingError, match="degrees of longitude and latitude, which no scale turns into metres"):
+        session.do(commands.set_scale(FEET))
+    assert session.document is before
+    with pytest.raises(SettingError, match="degrees"):
+        session.require_scale()
+    session.do(commands.rename_plot("somewhere"))
+    session.do(commands.set_scale(ScaleEstimate()))
+    with pytest.raises(UnscaledCloudError):
+        session.require_scale()
+
+
+@pytest.mark.parametrize(
+    ("command", "moves"),
+    [
+        (commands.set_scale(FEET), True),
+        (commands.set_up("+y"), True),
+        (commands.set_frame(north=(1.0, 1.0, 0.0)), True),
+        (commands.set_frame(origin_src=(1.0, 0.0, 0.0)), True),
+        (commands.delete_trunk(2), False),
+        (commands.change_settings("measure", curve="ellipse"), False),
+        (commands.rename_plot("other"), False),
+    ],
+    ids=lambda value: getattr(value, "label", ""),
+)
+def test_a_change_says_whether_points_lie_elsewhere(command, moves):
+    session, _ = make_session()
+    assert session.do(command).moves_points is moves
+    assert session.undo().moves_points is moves
 
 
 def test_history_is_capped():

@@ -1,12 +1,7 @@
 """Helpers for tests in a real Chromium, drawing in software.
 
 Software drawing takes about 2 s per frame and million points: keep clouds in browser tests below 100 000 points, and
-start the browser once per test file::
-
-    @pytest.fixture(scope="module")
-    def chromium(chromium_path):                # skips where there is no browser
-        with browser.chromium(chromium_path) as running:
-            yield running
+take the fixture `chromium`, which is one browser for all test files::
 
     page = browser.open_page(chromium, server.url)
     browser.wait_for_points(page, 60_000)

@@ -56,6 +56,7 @@ from websockets.sync.client import connect
 
 BRIDGE_LABEL = "dbh-bridge"
 PART_BYTES = 512 * 1024
+_NO_DOUBLE_CLICK_S = 0.45
 _serials = itertools.count(1)
 
 
@@ -154,6 +155,7 @@ class FakeClient:
         cookie = login(url) if cookie is None else cookie
         all_headers = {**({"Cookie": cookie} if cookie else {}), **(headers or {})}
         self.elements: dict[str, Element] = {}
+        self._pressed_at: dict[str, float] = {}
         self.notifications: list[Notification] = []
         self.downloads: dict[str, bytes] = {}
         self.javascript: list[str] = []
@@ -416,9 +418,14 @@ class FakeClient:
         """Properties of an element: ``options``, ``min``, ``disabled`` …"""
         return self.element(label).props
 
-    def press(self, label: str, *, force: bool = False) -> None:
-        """Press a button."""
-        self._update(self.element(label, force=force), True, force)
+    def press(self, label: str, *, force: bool = False, hurried: bool = False) -> None:
+        """Press a button; the same one again after so long that it is no double click, unless `hurried` or forced."""
+        element = self.element(label, force=force)
+        wait_s = self._pressed_at.get(element.uuid, 0.0) + _NO_DOUBLE_CLICK_S - time.monotonic()
+        if wait_s > 0 and not (force or hurried):
+            time.sleep(wait_s)
+        self._pressed_at[element.uuid] = time.monotonic()
+        self._update(element, True, force)
 
     def set(self, label: str, value: Any, *, force: bool = False) -> None:
         """Change an input; the page shows the new value at once, as a browser does."""

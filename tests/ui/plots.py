@@ -77,3 +77,8 @@ def endless_search(points_world: Any, settings: Settings, existing_ids: Any = No
     for step in range(4000):
         progress(0.1 + step / 10_000, f"Looking behind tree {step}")
         time.sleep(0.02)
+
+
+def endless_ground(points_world: Any, settings: Any, *, progress: Progress) -> None:
+    """In place of `ground_of`."""
+    endless_search(points_world, settings, progress=progress)

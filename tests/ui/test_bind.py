@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,26 +14,6 @@ from fakeclient import FakeClient
 from dbh_studio.errors import CancelledError, MalformedFileError, StudioError
 from dbh_studio.ui.bind import SceneClick, SceneRectangle, TabWorker, for_each_tab
 from dbh_studio.ui.server import StudioServer, start_server
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[StudioServer]:
-    running = start_server(port=0)
-    yield running
-    running.stop()
-
-
-@pytest.fixture
-def tab(server: StudioServer) -> Iterator[FakeClient]:
-    with FakeClient(server.url) as client:
-        yield client
-
-
-@pytest.fixture
-def worker(server: StudioServer, tab: FakeClient) -> Iterator[TabWorker]:
-    made = TabWorker(tab.handle(server.viser))
-    yield made
-    made.close()
 
 
 class Gate:
@@ -66,7 +45,7 @@ def test_click_then_press_keeps_its_order(worker: TabWorker, tab: FakeClient) ->
     tab.element("Delete")
     for _ in range(20):
         tab.click_scene((0, 0, 1))
-        tab.press("Delete")
+        tab.press("Delete", hurried=True)
         tab.command("Undo")
     tab.wait(lambda _: len(seen) == 60)
     assert seen == ["click", "delete", "undo"] * 20
@@ -151,10 +130,9 @@ def test_a_button_works_again_after_its_handler_failed(worker: TabWorker, tab: F
 def test_cancel_does_not_wait_in_the_queue(worker: TabWorker, tab: FakeClient) -> None:
     gate = Gate()
     worker.on_click(worker.client.gui.add_button("Run"), gate)
-    worker.on_cancel(worker.client.gui.add_button("Cancel"), gate.release.set)
     tab.press("Run")
     assert gate.started.wait(5)
-    tab.press("Cancel")
+    worker.run_at_once(gate.release.set)
     assert gate.release.wait(5)
 
 
@@ -293,7 +271,6 @@ def test_after_close_nothing_runs_and_nothing_listens(worker: TabWorker, tab: Fa
     button, box = gui.add_button("Go"), gui.add_checkbox("Box", False)
     command = worker.add_command("Undo", lambda: seen.append("undo"))
     worker.on_click(button, lambda: seen.append("go"))
-    worker.on_cancel(button, lambda: seen.append("cancel"))
     worker.on_update(box, seen.append)
     worker.on_scene_click(worker.client, lambda _: seen.append("click"))
     worker.on_close(lambda: seen.append("closed"))
@@ -307,6 +284,7 @@ def test_after_close_nothing_runs_and_nothing_listens(worker: TabWorker, tab: Fa
     assert not button._impl.update_cb and not box._impl.update_cb and not command._impl.trigger_cb
     assert not worker.client.scene._scene_pointer_cb
     worker.on_close(lambda: seen.append("closed late"))
+    worker.run_at_once(seen.append, "too late")
     worker.notify("never shown")
     worker._thread.join(5)
     assert not worker._thread.is_alive()

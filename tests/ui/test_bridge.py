@@ -6,7 +6,6 @@ import html
 import json
 import re
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -15,27 +14,12 @@ from fakeclient import BRIDGE_LABEL, FakeClient
 from dbh_studio.ui import bridge as bridge_module
 from dbh_studio.ui.bind import TabWorker
 from dbh_studio.ui.bridge import Bridge, call, esc, js
-from dbh_studio.ui.server import StudioServer, start_server
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[StudioServer]:
-    running = start_server(port=0)
-    yield running
-    running.stop()
+from dbh_studio.ui.server import StudioServer
 
 
 @pytest.fixture
-def tab(server: StudioServer) -> Iterator[FakeClient]:
-    with FakeClient(server.url) as client:
-        yield client
-
-
-@pytest.fixture
-def bridge(server: StudioServer, tab: FakeClient) -> Iterator[Bridge]:
-    worker = TabWorker(tab.handle(server.viser))
-    yield Bridge(worker)
-    worker.close()
+def bridge(worker: TabWorker) -> Bridge:
+    return Bridge(worker)
 
 
 def send_text(tab: FakeClient, text: Any) -> None:

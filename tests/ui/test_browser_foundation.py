@@ -76,62 +76,62 @@ def studio() -> Iterator[Studio]:
     made.server.stop()
 
 
-def test_the_page_works_behind_the_guard(studio: Studio, chromium_path: str) -> None:
-    """One browser start for everything: each step is a thing a person does."""
-    with browser.chromium(chromium_path) as chromium:
-        # Without the link there is no page.
-        stranger = browser.open_page(chromium, f"http://127.0.0.1:{studio.server.port}/", wait=False)
-        assert "full link" in stranger.inner_text("body")
-        stranger.context.close()
+def test_the_page_works_behind_the_guard(studio: Studio, chromium: Any) -> None:
+    """One page for everything: each step is a thing a person does."""
+    # Without the link there is no page.
+    stranger = browser.open_page(chromium, f"http://127.0.0.1:{studio.server.port}/", wait=False)
+    assert "full link" in stranger.inner_text("body")
+    stranger.context.close()
 
-        # The link logs in, leaves the address bar, and the page connects.
-        page = browser.open_page(chromium, studio.server.url + "&fixedDpr=1")
-        page.wait_for_selector("tr.row")
-        assert studio.server.guard.token not in page.url
-        (cookie,) = page.context.cookies()
-        assert cookie["httpOnly"] and cookie["sameSite"] == "Strict"
-        assert page.evaluate("() => document.cookie") == ""
+    # The link logs in, leaves the address bar, and the page connects.
+    page = browser.open_page(chromium, studio.server.url + "&fixedDpr=1")
+    page.wait_for_selector("tr.row")
+    assert studio.server.guard.token not in page.url
+    (cookie,) = page.context.cookies()
+    assert cookie["httpOnly"] and cookie["sameSite"] == "Strict"
+    assert page.evaluate("() => document.cookie") == ""
 
-        # Page -> Python, from a script and from a row with a hostile name, which stays text.
-        page.evaluate("() => window.dbh('script', {a: [1, 'é']})")
-        assert studio.wait("script") == {"a": [1, "é"]}
-        page.click("tr.row")
-        assert studio.wait("row") == HOSTILE
-        assert HOSTILE in page.inner_text("tr.row") and page.evaluate("() => window.broken") is None
+    # Page -> Python, from a script and from a row with a hostile name, which stays text.
+    page.evaluate("() => window.dbh('script', {a: [1, 'é']})")
+    assert studio.wait("script") == {"a": [1, "é"]}
+    page.click("tr.row")
+    assert studio.wait("row") == HOSTILE
+    assert HOSTILE in page.inner_text("tr.row") and page.evaluate("() => window.broken") is None
 
-        # The studio's own pages are images the page may show.
-        assert page.evaluate(LOAD_IMAGE, "/frame.svg") == 64
+    # The studio's own pages are images the page may show.
+    assert page.evaluate(LOAD_IMAGE, "/frame.svg") == 64
 
-        # A file, a hotkey, and a click whose ray meets the point that was clicked.
-        page.set_input_files(
-            f"[id='file_upload_{studio.upload._impl.uuid}']",
-            [{"name": "a.ply", "mimeType": "", "buffer": b"x" * 600_000}],
-        )
-        assert studio.wait("upload") == ("a.ply", b"x" * 600_000)
-        browser.wait_for_points(page, 5000)
-        browser.close_notifications(page)
-        page.mouse.move(300, 600)
-        page.keyboard.press("m")
-        assert studio.wait("hotkey")
-        page.mouse.click(*browser.pixel_of(page, TARGET))
-        click: SceneClick = studio.wait("click")
-        offset = np.array(TARGET) - click.ray_origin
-        distance = np.linalg.norm(np.cross(offset, click.ray_direction))
-        assert distance < 2 * click.view.pixel_angle_rad * np.linalg.norm(offset)
-        np.testing.assert_allclose(click.view.ray(click.screen_xy), click.ray_direction, atol=2e-3)
+    # A file, a hotkey, and a click whose ray meets the point that was clicked.
+    page.set_input_files(
+        f"[id='file_upload_{studio.upload._impl.uuid}']",
+        [{"name": "a.ply", "mimeType": "", "buffer": b"x" * 600_000}],
+    )
+    assert studio.wait("upload") == ("a.ply", b"x" * 600_000)
+    browser.wait_for_points(page, 5000)
+    browser.close_notifications(page)
+    page.mouse.move(300, 600)
+    page.keyboard.press("m")
+    assert studio.wait("hotkey")
+    page.mouse.click(*browser.pixel_of(page, TARGET))
+    click: SceneClick = studio.wait("click")
+    offset = np.array(TARGET) - click.ray_origin
+    distance = np.linalg.norm(np.cross(offset, click.ray_direction))
+    assert distance < 2 * click.view.pixel_angle_rad * np.linalg.norm(offset)
+    np.testing.assert_allclose(click.view.ray(click.screen_xy), click.ray_direction, atol=2e-3)
 
-        # A foreign address is not reachable from the page.
-        blocked = "() => fetch('http://192.0.2.1/').then(() => 'sent', e => String(e))"
-        assert "sent" not in page.evaluate(blocked)
-        errors = [error for error in browser.page_errors(page) if "192.0.2.1" not in error]
-        assert errors == []
-        assert any(re.search("Content Security Policy", error) for error in browser.page_errors(page))
+    # A foreign address is not reachable from the page.
+    blocked = "() => fetch('http://192.0.2.1/').then(() => 'sent', e => String(e))"
+    assert "sent" not in page.evaluate(blocked)
+    errors = [error for error in browser.page_errors(page) if "192.0.2.1" not in error]
+    assert errors == []
+    assert any(re.search("Content Security Policy", error) for error in browser.page_errors(page))
 
-        # A dropped connection comes back as a new tab with a new bridge.
-        studio.seen.clear()
-        studio.server.viser._websock_server.disconnect_all_clients()
-        page.wait_for_function("() => !document.querySelector('tr.row')", polling=20)
-        page.wait_for_selector("tr.row")
-        page.evaluate("() => window.dbh('script', 'again')")
-        assert studio.wait("script") == "again"
-        assert [tab.closed for tab in studio.tabs] == [True, False]
+    # A dropped connection comes back as a new tab with a new bridge.
+    studio.seen.clear()
+    studio.server.viser._websock_server.disconnect_all_clients()
+    page.wait_for_function("() => !document.querySelector('tr.row')", polling=20)
+    page.wait_for_selector("tr.row")
+    page.evaluate("() => window.dbh('script', 'again')")
+    assert studio.wait("script") == "again"
+    assert [tab.closed for tab in studio.tabs] == [True, False]
+    page.context.close()

@@ -1,6 +1,6 @@
 """What a forester does, in a real Chromium: clicks go through the page, numbers are compared with the session.
 
-One browser and one page for the file, a freshly measured plot for each test. The plot is small: the browser
+One page and one measured plot for the file, which every test leaves as it was. The plot is small: the browser
 draws in software here.
 """
 
@@ -18,6 +18,7 @@ import plots
 import pytest
 from PIL import Image
 
+from dbh_studio.app.session import Session
 from dbh_studio.core.dbh import CurveFit
 from dbh_studio.io.inventory_csv import inventory_csv
 from dbh_studio.ui.server import start_server
@@ -27,12 +28,6 @@ pytestmark = pytest.mark.browser
 
 LAPTOP = (1280, 720)
 LONG_S = 60.0
-
-
-@pytest.fixture(scope="module")
-def chromium(chromium_path: str) -> Iterator[Any]:
-    with browser.chromium(chromium_path) as running:
-        yield running
 
 
 @pytest.fixture(scope="module")
@@ -61,15 +56,29 @@ def page(shared_page: Any) -> Iterator[Any]:
     assert errors == []
 
 
+@pytest.fixture(scope="module")
+def session(studio: Studio, tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """The plot of this file, with its trunks found and measured; every test gets it as it is now."""
+    studio.adopt(plots.measured_session(tmp_path_factory.mktemp("plot")))
+    assert studio.session is not None
+    return studio.session
+
+
 @pytest.fixture
-def measured(studio: Studio, tmp_path: Path, page: Any) -> Any:
-    """The page with a plot whose trunks are found and measured, none chosen, trunks in red."""
-    studio.adopt(plots.measured_session(tmp_path))
+def measured(studio: Studio, session: Session, page: Any) -> Iterator[Any]:
+    """The page with that plot, none of its trees chosen, trunks in red. What the test does to the plot is undone."""
+    before = session.document
+    for tab in studio._tabs.values():
+        tab.worker.post(tab.adopt_session)
     page.wait_for_selector("button[data-step=inspect][data-active=true]")
     page.get_by_text("No tree is chosen.").wait_for()
     page.click("#dbh-view button[data-mode='Segmentation (red)']")
+    page.click("#dbh-view button[data-look=plot]")
     wait_until_painted(page, studio)
-    return page
+    assert studio.wait_idle(LONG_S)
+    yield page
+    while session.document is not before:
+        session.undo()
 
 
 def wait_until_painted(page: Any, studio: Studio) -> None:

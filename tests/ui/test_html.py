@@ -137,9 +137,10 @@ def test_the_bar_of_a_job_stays_in_its_box(fraction, width):
     assert f'"{width}"' in html.job_js(fraction, "")
 
 
-def test_curves_are_called_by_their_titles():
-    text = "curves disagree by 5 %: fourier 29.5 cm, ellipse 29.5 cm, bspline 31.1 cm"
-    assert html.plain(text) == "Curves disagree by 5 %: Fourier 29.5 cm, ellipse 29.5 cm, B-spline 31.1 cm"
+def test_a_reason_begins_with_a_capital_and_keeps_the_rest():
+    assert html.plain("curves disagree: Fourier 29.5 cm, B-spline 31.1 cm") == (
+        "Curves disagree: Fourier 29.5 cm, B-spline 31.1 cm"
+    )
     assert html.plain("") == ""
 
 

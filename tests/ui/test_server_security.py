@@ -58,19 +58,6 @@ class Panel:
         return seen
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[StudioServer]:
-    running = start_server(port=0)
-    yield running
-    running.stop()
-
-
-@pytest.fixture
-def tab(server: StudioServer) -> Iterator[FakeClient]:
-    with FakeClient(server.url) as client:
-        yield client
-
-
 @pytest.fixture(params=["shared", "private"])
 def panel(request: pytest.FixtureRequest, server: StudioServer, tab: FakeClient) -> Iterator[Panel]:
     """The same elements once for all tabs and once for this tab only: each scope has its own dispatcher."""
@@ -91,6 +78,15 @@ def events_up_to_go(tab: FakeClient, panel: Panel) -> list[str]:
     tab.press(f"{panel.prefix} go")
     tab.wait(lambda _: f"{panel.prefix} go" in panel.events)
     return [event for event in panel.events if event != f"{panel.prefix} go"]
+
+
+def test_a_cookie_of_another_program_does_not_lock_anybody_out(server: StudioServer) -> None:
+    """Cookies do not know ports: whatever else runs on this machine may have set one."""
+    base = f"http://127.0.0.1:{server.port}/"
+    cookie = login(server.url)
+    for odd in ('state={"a": [1, 2], "b"}', "a b=c", "=", "x" * 50, '"', "dbh_studio=1"):
+        assert http_get(base, {"Cookie": f"{odd}; {cookie}; {odd}"})[0] == 200, odd
+    assert http_get(base, {"Cookie": f"{cookie}x"})[0] == 401
 
 
 # -- the door -------------------------------------------------------------------------------------------------------

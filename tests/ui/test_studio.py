@@ -10,6 +10,7 @@ import numpy as np
 import plots
 import pytest
 from fakeclient import FakeClient
+from panel import LONG, find_trunks, open_by_path, table_ids
 
 from dbh_studio.app import commands
 from dbh_studio.app.opening import open_plot
@@ -17,15 +18,6 @@ from dbh_studio.core.reconstruction import TriangleMesh
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.ui.server import start_server
 from dbh_studio.ui.studio import Studio
-
-LONG = 60.0
-
-
-@pytest.fixture
-def studio(tmp_path):
-    running = Studio(start_server(port=0), uploads_folder=tmp_path / "uploads")
-    yield running
-    running.close()
 
 
 @pytest.fixture
@@ -37,36 +29,6 @@ def tab(studio):
 @pytest.fixture
 def plot_path(tmp_path):
     return plots.write_laz(tmp_path)
-
-
-def open_by_path(tab, path):
-    tab.wait_text("Open a point cloud")
-    tab.set("File or folder", str(path))
-    tab.press("Open")
-    tab.wait_text("Press Find trunks", LONG)
-    tab.bridge_send("step", "trunks")
-    tab.wait(lambda t: path.stem in t.text() and t.has("Find trunks"), LONG)
-
-
-def find_trunks(tab, studio):
-    tab.press("Find trunks")
-    tab.wait_text("trunks found", LONG)
-    assert studio.wait_idle(LONG)
-    tab.wait(lambda t: "not measured yet" not in t.text(), LONG)
-
-
-@pytest.fixture
-def measured(studio, tmp_path):
-    """A tab that shows a plot whose trunks are found and measured."""
-    studio.adopt(plots.measured_session(tmp_path))
-    with FakeClient(studio.server.url) as client:
-        client.wait(table_ids, LONG)
-        client.wait(lambda t: "/labels" in t.scene, LONG)
-        yield client
-
-
-def table_ids(tab):
-    return [int(row.split('"')[0]) for row in tab.html().split('<tr data-id="')[1:]]
 
 
 def test_from_an_empty_studio_to_the_inventory(tab, studio, plot_path):
@@ -181,6 +143,7 @@ def test_an_unscaled_cloud_is_not_measured_until_it_has_a_scale(tab, studio, tmp
     tab.wait_notification("no scale")
     assert len(studio.session.document.trunks) == 0
     tab.bridge_send("step", "scale")
+    tab.bridge_send("scale-way", "number")
     tab.set("One unit is", "another unit")
     tab.set("Metres per unit", 1.7)
     tab.press("Set scale")
@@ -464,6 +427,7 @@ def test_scale_from_a_known_distance(tab, studio, tmp_path):
     tab.press("Open")
     tab.wait_text("This cloud has no scale yet", LONG)
     tab.bridge_send("step", "scale")
+    tab.bridge_send("scale-way", "number")
     tab.set("One unit is", "found from a known distance")
     tab.wait(lambda t: t.has("True length (m)") and not t.has("Metres per unit"))
     tab.set("True length (m)", 3.4)

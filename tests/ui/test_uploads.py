@@ -28,12 +28,6 @@ def server() -> Iterator[StudioServer]:
     running.stop()
 
 
-@pytest.fixture
-def tab(server: StudioServer) -> Iterator[FakeClient]:
-    with FakeClient(server.url) as client:
-        yield client
-
-
 class Inbox:
     """An upload button and what came of it."""
 
@@ -53,10 +47,8 @@ class Inbox:
 
 
 @pytest.fixture
-def inbox(server: StudioServer, tab: FakeClient) -> Iterator[Inbox]:
-    worker = TabWorker(tab.handle(server.viser))
-    yield Inbox(worker)
-    worker.close()
+def inbox(worker: TabWorker) -> Inbox:
+    return Inbox(worker)
 
 
 def n_files_kept(server: StudioServer) -> int:
@@ -309,3 +301,24 @@ def test_receive_checks_the_kind_and_says_where_it_failed(tmp_path: Path) -> Non
     assert receive(file, tmp_path / "plots", allowed_suffixes=(".ply",)).read_bytes() == b"abc"
     assert not source.exists()
     file.discard()
+
+
+def test_a_temporary_folder_that_was_swept_away_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uploads.tempfile, "tempdir", str(tmp_path))
+    desk, done, refused = UploadDesk(), [], []
+    rule = UploadRule((".ply",), LIMIT, done.append, refused.append)
+    for transfer in ("first", "second"):
+        assert desk.start(1, transfer, rule, "a.ply", 1, 3)
+        desk.part(1, transfer, 0, b"ply")
+        for folder in tmp_path.iterdir():
+            uploads.shutil.rmtree(folder)
+    assert len(done) == 2 and not refused
+    desk.close()
+
+
+def test_the_bar_of_an_upload_that_is_refused_goes(inbox: Inbox, tab: FakeClient) -> None:
+    source = tab.element("Upload").uuid
+    tab.upload_start(source, "t", "a.ply", 2, 2 * PART_BYTES)
+    tab.upload_part(source, "t", 0, b"x" * PART_BYTES)
+    tab.upload_part(source, "t", 7, b"x")
+    tab.wait(lambda _: inbox.progress[-1:] == [(0, 0)])

@@ -100,7 +100,7 @@ def add_length(length: ScaleBar | MarkerSquare) -> Command:
     return Command(f"Mark {length.name}", apply)
 
 
-def change_length(name: str, **values: Any) -> Command:
+def change_length(name: str, /, **values: Any) -> Command:
     """Say another `length_m`, `side_m`, `role`, `name` or other field of a known length."""
 
     def apply(document: Document) -> Document:

@@ -175,12 +175,41 @@ def strike_out(
     """
     others = tuple(each for each in document.evidence.struck if each != sight)
     left_out = (*others, sight) if struck else others
-    search = place_markers(detections, posed, sides_of(document), left_out)
-    evidence = replace(document.evidence, struck=left_out).with_found(search.squares)
-    report = evidence.report(np.array(document.up_direction))
-    is_measured = document.scale.source in ("unknown", "marker", "bars")
     what = f"{sight[1]} {sight[2]} in {sight[0]}"
     label = f"Strike out {what}" if struck else f"Use {what} again"
+    search = place_markers(detections, posed, sides_of(document), left_out)
+    return _placed_anew(document, search, left_out, label)
+
+
+def use_marker(
+    document: Document, detections: Sequence[Detection], posed: PosedImages, marker: MarkerKey, side_m: float
+) -> Command:
+    """One step: believe a marker that few photos show, place the markers anew, and take the scale from them.
+
+    Raises:
+        CommandError: Also the person's word does not make a marker of it; says why.
+    """
+    name = f"{marker[0]} {marker[1]}"
+    struck = document.evidence.struck
+    search = place_markers(detections, posed, sides_of(document) | {marker: side_m}, struck)
+    if not any(square.marker == marker for square in search.squares):
+        why = next((refusal for other, refusal in search.problems if other == name), None)
+        if why is not None:
+            raise CommandError(why.reason, why.remedy)
+        if search.report.estimate is None and search.squares == ():
+            raise CommandError(search.report.verdict.message, search.report.verdict.remedy)
+        raise CommandError(
+            f"{name} is not seen in two photos from different places that agree.", "Mark its corners by hand."
+        )
+    return _placed_anew(document, search, struck, f"Use {name}")
+
+
+def _placed_anew(
+    document: Document, search: MarkerSearch, struck: tuple[tuple[str, str, int], ...], label: str
+) -> Command:
+    evidence = replace(document.evidence, struck=struck).with_found(search.squares)
+    report = evidence.report(np.array(document.up_direction))
+    is_measured = document.scale.source in ("unknown", "marker", "bars")
     return set_evidence(evidence, label=label, scale=report.estimate if is_measured else None)
 
 

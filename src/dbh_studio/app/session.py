@@ -348,8 +348,11 @@ class Session:
         self._cameras = cameras
 
     def require_scale(self, document: Document | None = None) -> None:
-        """Raise UnscaledCloudError, which says what to do, unless lengths are in metres."""
-        if not (document or self._document).scale.is_known:
+        """Raise UnscaledCloudError, or SettingError for degrees, unless lengths are in metres; it says what to do."""
+        document = document or self._document
+        # A plot saved by an earlier version may have a scale that no cloud of degrees can have.
+        check_scale(document.scale, document.source.path.name, is_geographic=self._is_geographic)
+        if not document.scale.is_known:
             raise UnscaledCloudError(UNSCALED_REASON, UNSCALED_REMEDY)
 
     def flush(self) -> None:

@@ -266,7 +266,7 @@ class ScaleEvidence:
         A marker found again keeps the role and the side a person gave it. One that has the name of a length marked by
         hand gets another.
         """
-        before = {square.marker: square for square in self.squares if square.marker is not None}
+        before: dict[MarkerKey | None, MarkerSquare] = {s.marker: s for s in self.squares if s.marker is not None}
         # A number that stands at two places gives two squares, which only their names tell apart.
         by_name = {square.name: square for square in before.values()} | {s.name: s for s in self.squares if s.marker}
         by_hand = tuple(square for square in self.squares if square.marker is None)

@@ -8,7 +8,9 @@ callback here is a coroutine that reads the value and puts work in the queue of 
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
@@ -32,6 +34,7 @@ _COLOURS: dict[Level, Any] = {"info": "blue", "success": "green", "warning": "ye
 _CLOSES_AFTER_S: dict[Level, float | None] = {"info": 5.0, "success": 4.0, "warning": 12.0, "error": None}
 _MAX_NOTE_CHARS = 600
 _MAX_QUEUED = 1000
+_DOUBLE_CLICK_S = 0.4
 # These move the camera in the page whatever else they are bound to.
 CAMERA_KEYS = frozenset("WASDQE") | {"arrowup", "arrowdown", "arrowleft", "arrowright"}
 
@@ -152,6 +155,11 @@ class TabWorker:
                     self._running = False
                     self._changed.notify_all()
 
+    def run_at_once(self, fn: Callable[..., Any], *args: Any) -> None:
+        """Run `fn` beside the queue: to cancel the work that fills it, and for nothing else."""
+        if not self._closed:
+            threading.Thread(target=self.attempt, args=(fn, *args), name="at once", daemon=True).start()
+
     def attempt(self, fn: Callable[..., Any], *args: Any) -> None:
         """Run `fn` here and now; show what goes wrong instead of raising it."""
         try:
@@ -171,6 +179,11 @@ class TabWorker:
         """Wait until the queue is empty and nothing runs. Returns whether that came to pass."""
         with self._changed:
             return self._changed.wait_for(lambda: self._closed or not (self._queue or self._running), timeout)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether work is waiting."""
+        return bool(self._queue)
 
     @property
     def closed(self) -> bool:
@@ -233,7 +246,7 @@ class TabWorker:
         Args:
             button: A viser button.
             fn: Takes nothing.
-            once_at_a_time: Drop a press while `fn` still waits or runs: a double click acts once.
+            once_at_a_time: Drop a press while `fn` still waits or runs, and the second one of a double click.
         """
         self._on_press(button.on_click, button, fn, once_at_a_time)
 
@@ -242,30 +255,22 @@ class TabWorker:
         self._on_press(command.on_trigger, command, fn, once_at_a_time)
 
     def _on_press(self, register: Callable[..., Any], handle: Any, fn: Callable[[], Any], once_at_a_time: bool) -> None:
-        pending = threading.Event()
+        pending, pressed_at = threading.Event(), -math.inf
 
         async def pressed(event: Any) -> None:
-            if not self._is_mine(event) or (once_at_a_time and pending.is_set()):
+            nonlocal pressed_at
+            if not self._is_mine(event):
                 return
+            is_double = pending.is_set() or time.monotonic() - pressed_at < _DOUBLE_CLICK_S
+            if once_at_a_time and is_double:
+                return
+            pressed_at = time.monotonic()
             pending.set()
             if not self._put(_Job(fn, (), finished=pending.clear)):
                 pending.clear()
 
         register(pressed)
         self.on_close(lambda: _forget(handle, pressed))
-
-    def on_cancel(self, button: Any, fn: Callable[[], Any]) -> None:
-        """Run `fn` at once when the button is pressed, past the queue: the work to cancel is what fills it.
-
-        `fn` runs beside the tab's work and must do no more than ask that work to stop.
-        """
-
-        def pressed(event: Any) -> None:
-            if self._is_mine(event) and not self._closed:
-                self.attempt(fn)
-
-        button.on_click(pressed)
-        self.on_close(lambda: _forget(button, pressed))
 
     def on_update(self, handle: Any, fn: Callable[[Any], Any], *, coalesce: bool = False) -> None:
         """Run `fn(value)` when the person changes an input.
@@ -314,6 +319,15 @@ class TabWorker:
         client.scene.on_rect_select(modifier=modifier)(dragged)  # type: ignore[arg-type]
         self.on_close(lambda: client.scene.remove_rect_select_callback(dragged))
 
+    def on_dragged(self, arrows: viser.TransformControlsHandle, fn: Callable[[Float64], Any]) -> None:
+        """Run `fn((3,) world)` when the person lets go of what they dragged. It ends with the arrows."""
+
+        async def moved(event: viser.TransformControlsEvent) -> None:
+            if self._is_mine(event) and event.phase == "end":
+                self.post(fn, np.array(event.target.position, np.float64))
+
+        arrows.on_update(moved)
+
     def on_upload(
         self,
         upload_button: Any,
@@ -331,17 +345,23 @@ class TabWorker:
             fn: Runs in the tab's queue.
             allowed_suffixes: Lower case, with the dot.
             max_bytes: Of this button; larger files are refused with the advice to open them by path.
-            on_progress: `on_progress(bytes_received, bytes_total)`, in the queue, the latest only.
+            on_progress: `on_progress(bytes_received, bytes_total)`, in the queue, the latest only; (0, 0) where nothing
+                more comes.
         """
         rule = UploadRule(
             suffixes=allowed_suffixes,
             max_bytes=max_bytes,
             on_done=lambda file: self._take_upload(fn, file),
-            on_refused=self.notify_error,
+            on_refused=partial(self._upload_refused, on_progress),
             on_progress=on_progress and partial(self.post_latest, ("upload", id(upload_button)), on_progress),
         )
         uploads.set_rule(upload_button, rule)
         self.on_close(lambda: uploads.set_rule(upload_button, None))
+
+    def _upload_refused(self, on_progress: Callable[[int, int], Any] | None, error: FileError) -> None:
+        self.notify_error(error)
+        if on_progress is not None:
+            self.post(on_progress, 0, 0)
 
     def _take_upload(self, fn: Callable[[UploadedFile], Any], file: UploadedFile) -> None:
         if not self._put(_Job(fn, (file,), finished=file.discard)):

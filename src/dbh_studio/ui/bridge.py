@@ -10,6 +10,7 @@ import html
 import json
 import logging
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from viser import _messages as wire
@@ -65,7 +66,7 @@ class Bridge:
 
     def __init__(self, worker: TabWorker) -> None:
         self._worker = worker
-        self._handlers: dict[str, tuple[Callable[[Any], Any], bool]] = {}
+        self._handlers: dict[str, Callable[[Any], Any]] = {}
         self._inbox = worker.client.gui.add_text(INPUT_LABEL, "", visible=False)
         let_page_scripts_write(self._inbox, MAX_MESSAGE_CHARS)
 
@@ -76,15 +77,22 @@ class Bridge:
 
         self.run(_PAGE_SCRIPT % js(self._inbox._impl.uuid))
 
-    def on(self, kind: str, fn: Callable[[Any], Any], *, coalesce: bool = False) -> None:
+    def on(self, kind: str, fn: Callable[[Any], Any], *, coalesce: bool = False, at_once: bool = False) -> None:
         """Run `fn(payload)` for every message of this kind.
 
         Args:
             kind: One handler per kind; a new one replaces the old.
             fn: Gets JSON data as Python values. It comes from a browser: check its type and range.
             coalesce: While messages of this kind wait, keep the latest only: for strokes and hovering.
+            at_once: Run it beside the queue, see `TabWorker.run_at_once`: for Cancel.
         """
-        self._handlers[kind] = (fn, coalesce)
+        worker = self._worker
+        if at_once:
+            self._handlers[kind] = partial(worker.run_at_once, fn)
+        elif coalesce:
+            self._handlers[kind] = partial(worker.post_latest, ("bridge", kind), fn)
+        else:
+            self._handlers[kind] = partial(worker.post, fn)
 
     def run(self, javascript: str) -> None:
         """Run a script in the page. Values go into it through `js`, never by pasting text."""
@@ -96,13 +104,11 @@ class Bridge:
         except (ValueError, TypeError, RecursionError):
             log.debug("Dropped a malformed message from the page")
             return
-        fn, coalesce = self._handlers.get(kind, (None, False)) if isinstance(kind, str) else (None, False)
-        if fn is None:
+        take = self._handlers.get(kind) if isinstance(kind, str) else None
+        if take is None:
             log.debug("Dropped a message of unknown kind from the page")
-        elif coalesce:
-            self._worker.post_latest(("bridge", kind), fn, payload)
         else:
-            self._worker.post(fn, payload)
+            take(payload)
 
 
 def _reject_constant(name: str) -> None:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dbh_studio.core.arrays import Float32, Int64, UInt8
+from dbh_studio.core.arrays import Float32, Int32, Int64, UInt8
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.display import height_colours, rough_heights, sample_for_display
 from dbh_studio.core.picking import PickCloud
+from dbh_studio.core.trunks import TrunkSet
 
 CROWN_ABOVE_M = 6.0
 _COLOURS_TO_M = 12.0
@@ -63,3 +64,17 @@ class DisplayCloud:
         centre = 0.5 * (low + high)
         centre[2] = low[2] + min(0.15 * (high[2] - low[2]), 0.1 * float(np.max(high - low)))
         return centre, 0.5 * float(np.max((high - low)[:2], initial=0.1))
+
+    def trunk_ids(self, rows: Int64, trunks: TrunkSet) -> Int32:
+        """(K,) trunk id of (K,) points of this sample, 0 where none.
+
+        Looked up for the few points under a click: labels of the whole cloud would cost the first click after every
+        edit a tenth of a second for ten million points.
+        """
+        points = self.indices[rows].astype(np.int32)
+        ids = np.zeros(len(points), np.int32)
+        for trunk in trunks:
+            if len(trunk):
+                at = np.minimum(np.searchsorted(trunk.points, points), len(trunk) - 1)
+                ids[trunk.points[at] == points] = trunk.id
+        return ids

@@ -49,7 +49,12 @@ class SettingsForm(Generic[Model]):
         return changed
 
     def show(self, values: Model) -> None:
-        """Bring the inputs in step with a changed model (undo, reopen, another tab)."""
+        """Bring the inputs in step with a changed model (undo, reopen, another tab).
+
+        Where the model is as it was, what is being typed stays.
+        """
+        if values == self._values:
+            return
         self._values = values
         for name, handle in self._handles.items():
             set_value(handle, getattr(values, name))

@@ -15,7 +15,6 @@ import secrets
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from websockets.datastructures import Headers
@@ -138,13 +137,12 @@ class Guard:
         return name in self._names or (self._any_address and _is_address(name.strip("[]")))
 
     def _has_session(self, request: Request) -> bool:
+        # Split by hand: `http.cookies` gives up at the first cookie it does not like, which may be another program's.
         for header in request.headers.get_all("Cookie"):
-            try:
-                cookie = SimpleCookie(header).get(self.cookie_name)
-            except CookieError:
-                continue
-            if cookie is not None and _equal(cookie.value, self._session):
-                return True
+            for cookie in header.split(";"):
+                name, _, value = cookie.strip().partition("=")
+                if name == self.cookie_name and _equal(value, self._session):
+                    return True
         return False
 
     def _log_in(self, query: list[tuple[str, str]]) -> Response:

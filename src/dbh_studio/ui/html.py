@@ -33,14 +33,20 @@ def style_js() -> str:
 
 
 def plain(text: str) -> str:
-    """A sentence as a person reads it: a capital first, and the curves by their titles."""
-    for name, title in CURVE_TITLES.items():
-        text = text.replace(name, title if name != "ellipse" else name)
+    """A reason or a flag as a sentence: a capital first."""
     return text[:1].upper() + text[1:]
 
 
 def header(
-    plot_name: str, status: PlotStatus, active: StepName, *, saved: str, undo: str, redo: str, is_busy: bool = False
+    plot_name: str,
+    status: PlotStatus,
+    active: StepName,
+    *,
+    saved: str,
+    undo: str,
+    redo: str,
+    problem: str = "",
+    is_busy: bool = False,
 ) -> str:
     """Plot name, where it is saved, Undo and Redo, the five steps, and the sentence that says what to do now.
 
@@ -48,12 +54,16 @@ def header(
         plot_name: As the person calls it.
         status: What is done.
         active: The step on screen.
-        saved: Where the plot is saved, or that it is not.
+        saved: Where the plot is saved.
         undo: What Undo would undo; empty where nothing.
         redo: What Redo would do again; empty where nothing.
+        problem: Why it is not saved; in red, and in full.
         is_busy: A job runs: its box stands where the sentence would, so that nothing jumps.
     """
     done = status.done()
+    place = f'<div class="muted dbh-saved">{esc(saved)}</div>'
+    if problem:
+        place = message(f"NOT SAVED. {problem}", level="stop")
     buttons = "".join(
         f'<button type="button" data-step="{name}" data-state="{"done" if name in done else "open"}" '
         f'data-active="{"true" if name == active else "false"}" onclick="{call("step", name)}">'
@@ -63,7 +73,7 @@ def header(
     return (
         f'<div class="dbh"><div class="dbh-top"><h3 title="{esc(plot_name)}">{esc(plot_name or "No plot open")}</h3>'
         f"{_history_button('undo', '&#8630; Undo', undo)}{_history_button('redo', '&#8631; Redo', redo)}</div>"
-        f'<div class="muted dbh-saved">{esc(saved)}</div>'
+        f"{place}"
         f'<div class="dbh-steps">{buttons}</div>'
         f"{'' if is_busy else _hint(status, active)}</div>"
     )
@@ -140,6 +150,24 @@ def no_tree_card() -> str:
     return '<div class="dbh muted dbh-empty">No tree is chosen.</div>'
 
 
+def waiting_card(tree_id: int) -> str:
+    """The card of a tree that is yet to be measured."""
+    return (
+        f'<div class="dbh dbh-card" data-tree="{tree_id}"><div class="dbh-number">{_card_title(tree_id)}</div>'
+        '<div class="muted">Not measured yet.</div></div>'
+    )
+
+
+def _card_title(tree_id: int) -> str:
+    """The tree's number, and the arrows to its neighbours."""
+    before, after = (
+        f'<button type="button" data-do="{tip}" title="{tip} tree ({key})" '
+        f'onclick="{call("neighbour", n)}">{arrow}</button>'
+        for tip, key, n, arrow in (("Previous", "P", -1, "&#9664;"), ("Next", "N", 1, "&#9654;"))
+    )
+    return f'<h3>Tree {tree_id}</h3><span class="dbh-neighbours">{before}{after}</span>'
+
+
 def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "") -> str:
     """What the forester reads after clicking a trunk.
 
@@ -148,12 +176,7 @@ def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "")
         result: The diameter, or why there is none.
         section: The picture of the cross-section, see `section_svg`.
     """
-    before, after = (
-        f'<button type="button" data-do="{tip}" title="{tip} tree ({key})" '
-        f'onclick="{call("neighbour", n)}">{arrow}</button>'
-        for tip, key, n, arrow in (("Previous", "P", -1, "&#9664;"), ("Next", "N", 1, "&#9654;"))
-    )
-    title = f'<h3>Tree {tree_id}</h3><span class="dbh-neighbours">{before}{after}</span>'
+    title = _card_title(tree_id)
     if isinstance(result, Refusal):
         return (
             f'<div class="dbh dbh-card" data-tree="{tree_id}"><div class="dbh-number">{title}'

@@ -9,6 +9,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -39,26 +41,50 @@ COLOUR_MODES: tuple[ColourMode, ...] = get_args(ColourMode)
 MOST_FACES = 3_000_000
 _OVERLAY_BUDGET = 1_200_000
 _PER_TREE = 25_000
+# In sizes of the cloud's points: the chosen trunk covers its overlay, which covers the cloud.
+_OVERLAY_SIZE, _MARKED_SIZE = 1.25, 1.3
 # Narrower than viser's 75 degrees, at which upright stems near the edge look as if they leaned.
 _FOV_RAD = np.deg2rad(50.0)
 _RING_COLOUR = (20, 60, 190)
 
 
-class SceneView:
-    """The 3D side of one tab."""
+@dataclass(frozen=True, eq=False)
+class TrunkPicture:
+    """What is drawn of one trunk.
 
-    def __init__(self, client: viser.ClientHandle) -> None:
+    Attributes:
+        points: (N, 3) world.
+        rgb: (N, 3) the cloud's own colours of them, or None.
+        anchor: (3,) where its number goes, world.
+    """
+
+    points: Float32
+    rgb: UInt8 | None
+    anchor: Float64
+
+
+class SceneView:
+    """The 3D side of one tab.
+
+    Args:
+        client: The tab.
+        is_hurried: Whether the person has asked for more already, so that a flight is cut short.
+    """
+
+    def __init__(self, client: viser.ClientHandle, *, is_hurried: Callable[[], bool] = lambda: False) -> None:
         self._client = client
+        self._is_hurried = is_hurried
         self._scene = client.scene
         self._display: DisplayCloud | None = None
         self._mode: ColourMode = "Original"
         self._labels_on = True
         self._crowns_on = True
-        self._point_size = 0.02
+        self._point_size, self._size_factor = 0.02, 1.0
         self._clouds: list[Any] = []
         self._overlays: dict[int, tuple[Trunk, Any, Any]] = {}
         self._label_handles: dict[int, Any] = {}
-        self._highlight: list[Any] = []
+        self._marked: Any = None
+        self._ring: Any = None
         self._frames: dict[str, Any] = {}
         self._empty: list[Any] = []
         self._mesh: Any = None
@@ -68,6 +94,10 @@ class SceneView:
 
     # ---- the cloud
 
+    def shows(self, display: DisplayCloud) -> bool:
+        """Whether this very cloud has been sent."""
+        return self._display is display
+
     def show_plot(self, display: DisplayCloud) -> None:
         """Replace everything by this plot and look at it; the points arrive coarse first, in the background."""
         self.clear()
@@ -75,7 +105,7 @@ class SceneView:
             handle.remove()
         self._empty = []
         self._display = display
-        self._point_size = display.point_size
+        self._point_size = display.point_size * self._size_factor
         for name in (
             "/rgb",
             "/rgb/low",
@@ -97,7 +127,7 @@ class SceneView:
         """Remove the plot from the picture."""
         self._stream_stop.set()
         with self._lock:
-            self.highlight(None, None, None)
+            self.highlight(None)
             for handle in self._frames.values():
                 if handle.name.count("/") == 1:
                     handle.remove()
@@ -159,44 +189,34 @@ class SceneView:
 
     # ---- trunks
 
-    def show_trunks(self, trunks: dict[int, tuple[Trunk, Float32, UInt8 | None, Float64]]) -> None:
-        """Bring the overlays in step with the given trunks; unchanged ones are left alone.
-
-        Args:
-            trunks: For each id: the trunk, its points (world), their own colours, and where its number goes (world).
-        """
+    def show_trunks(self, trunks: Sequence[Trunk], picture_of: Callable[[Trunk], TrunkPicture]) -> None:
+        """Bring the overlays in step with the given trunks; those drawn already are not even looked at."""
         with self._lock, self._client.atomic():
-            for trunk_id in set(self._overlays) - set(trunks):
+            for trunk_id in set(self._overlays) - {trunk.id for trunk in trunks}:
                 self._remove_trunk(trunk_id)
             limit = min(_PER_TREE, _OVERLAY_BUDGET // max(len(trunks), 1))
-            for trunk_id, (trunk, points, rgb, anchor) in trunks.items():
-                known = self._overlays.get(trunk_id)
+            for trunk in trunks:
+                known = self._overlays.get(trunk.id)
                 if known is None or known[0] is not trunk:
-                    self._remove_trunk(trunk_id)
-                    red = self._add_trunk(f"/red/{trunk_id}", points, rgb, TRUNK_RED, limit, 1.25)
-                    own = self._add_trunk(f"/tree/{trunk_id}", points, rgb, tree_colour(trunk_id), limit, 1.25)
-                    self._overlays[trunk_id] = (trunk, red, own)
-                self._set_label(trunk_id, anchor, str(trunk_id))
+                    self._remove_trunk(trunk.id)
+                    picture = picture_of(trunk)
+                    red = self._add_trunk(f"/red/{trunk.id}", picture, TRUNK_RED, limit, _OVERLAY_SIZE)
+                    own = self._add_trunk(f"/tree/{trunk.id}", picture, tree_colour(trunk.id), limit, _OVERLAY_SIZE)
+                    self._overlays[trunk.id] = (trunk, red, own)
+                    self._label_handles[trunk.id] = self._scene.add_label(
+                        f"/labels/{trunk.id}",
+                        str(trunk.id),
+                        position=tuple(picture.anchor),
+                        anchor="bottom-center",
+                        font_screen_scale=0.85,
+                    )
 
-    def _add_trunk(
-        self, name: str, points: Float32, rgb: UInt8 | None, colour: tuple[int, int, int], limit: int, size: float
-    ) -> Any:
+    def _add_trunk(self, name: str, trunk: TrunkPicture, colour: tuple[int, int, int], limit: int, size: float) -> Any:
         """One trunk over the cloud: thinned, larger by a factor than the cloud's points, so that it covers them."""
-        chosen = np.sort(sample_for_display(len(points), limit))
-        shown = points[chosen]
-        colours = shaded(shown, colour, None if rgb is None else rgb[chosen])
+        chosen = np.sort(sample_for_display(len(trunk.points), limit))
+        shown = trunk.points[chosen]
+        colours = shaded(shown, colour, None if trunk.rgb is None else trunk.rgb[chosen])
         return self._add_points(name, shown, colours, size * self._point_size)
-
-    def _set_label(self, trunk_id: int, anchor: Float64, text: str) -> None:
-        label = self._label_handles.get(trunk_id)
-        if label is None:
-            self._label_handles[trunk_id] = self._scene.add_label(
-                f"/labels/{trunk_id}", text, position=tuple(anchor), anchor="bottom-center", font_screen_scale=0.85
-            )
-        else:
-            if label.text != text:
-                label.text = text
-            label.position = tuple(anchor)
 
     def _remove_trunk(self, trunk_id: int) -> None:
         known = self._overlays.pop(trunk_id, None)
@@ -207,21 +227,19 @@ class SceneView:
         if label is not None:
             label.remove()
 
-    def highlight(self, points: Float32 | None, rgb: UInt8 | None, ring: Float32 | None) -> None:
+    def highlight(self, trunk: TrunkPicture | None, ring: Float32 | None = None) -> None:
         """Draw one trunk in yellow with its measured ring, or nothing."""
         with self._lock:
-            for handle in self._highlight:
-                handle.remove()
-            self._highlight = []
-            if points is not None and len(points):
-                marked = self._add_trunk("/highlight", points, rgb, HIGHLIGHT_YELLOW, 2 * _PER_TREE, 1.3)
-                self._highlight.append(marked)
+            for handle in (self._marked, self._ring):
+                if handle is not None:
+                    handle.remove()
+            self._marked = self._ring = None
+            if trunk is not None and len(trunk.points):
+                self._marked = self._add_trunk("/highlight", trunk, HIGHLIGHT_YELLOW, 2 * _PER_TREE, _MARKED_SIZE)
             if ring is not None and len(ring) > 2:
                 segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)
-                self._highlight.append(
-                    self._scene.add_line_segments(
-                        "/ring", segments, _RING_COLOUR, thickness=5.0, thickness_units="screen"
-                    )
+                self._ring = self._scene.add_line_segments(
+                    "/ring", segments, _RING_COLOUR, thickness=5.0, thickness_units="screen"
                 )
 
     # ---- the mesh
@@ -274,6 +292,7 @@ class SceneView:
 
     def set_point_size(self, factor: float) -> None:
         """Scale all points by a factor of the size that fits the cloud's spacing."""
+        self._size_factor = factor
         if self._display is None:
             return
         with self._lock, self._client.atomic():
@@ -281,7 +300,9 @@ class SceneView:
             for handle in self._clouds:
                 handle.point_size = self._point_size
             for _, red, own in self._overlays.values():
-                red.point_size = own.point_size = 1.25 * self._point_size
+                red.point_size = own.point_size = _OVERLAY_SIZE * self._point_size
+            if self._marked is not None:
+                self._marked.point_size = _MARKED_SIZE * self._point_size
 
     # ---- the camera
 
@@ -323,6 +344,10 @@ class SceneView:
             away = clear_side(self._display.points, target, away, distance)
         self._move(target + distance * away + np.array([0.0, 0.0, 0.2 * distance]), target)
 
+    def look_along(self, position: Float64, direction: Float64, ahead: float) -> None:
+        """Stand at a point and look along a direction; one then turns about a point so far ahead."""
+        self._move(position, position + ahead * direction / np.linalg.norm(direction))
+
     def _move(
         self,
         position: Float64,
@@ -336,12 +361,13 @@ class SceneView:
         n_steps = 8 if animate else 1
         camera.up_direction, camera.fov = up, _FOV_RAD
         for step in range(1, n_steps + 1):
-            eased = step / n_steps
+            eased = 1.0 if self._is_hurried() else step / n_steps
             eased = eased * eased * (3 - 2 * eased)
             with self._client.atomic():
                 # Setting the position moves look_at along, so the order matters.
                 camera.position = start + (position - start) * eased
                 camera.look_at = start_look + (look_at - start_look) * eased
             self._client.flush()
-            if step < n_steps:
-                time.sleep(1 / 25)
+            if eased == 1.0:
+                return
+            time.sleep(1 / 25)

@@ -26,6 +26,7 @@ class PlotStatus:
     n_waiting: int = 0
     n_inspected: int = 0
     is_exported: bool = False
+    has_photos: bool = False
 
     def done(self) -> frozenset[StepName]:
         """The steps that need nothing more."""
@@ -51,7 +52,9 @@ class PlotStatus:
             return f"{self.n_trunks} trunks found, {self.n_waiting} not measured yet."
         hints: dict[StepName, str] = {
             "open": "Open a point cloud, or upload one.",
-            "scale": "This cloud has no scale yet. Say how long one unit of it is before measuring.",
+            "scale": "This cloud has no scale yet. Find the markers in its photos, or mark a length you know."
+            if self.has_photos
+            else "This cloud has no scale yet. Mark a length you know, or say how long one unit of it is.",
             "trunks": "Press Find trunks.",
             "inspect": f"{self.n_trunks} trunks found{refused}. Click a trunk in the picture or a row in the table.",
             "export": f"{self.n_measured} of {self.n_trunks} trees measured. Look through them, then export.",

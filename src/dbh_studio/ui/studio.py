@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import platformdirs
 
 from dbh_studio.app import pipeline
@@ -21,14 +22,16 @@ from dbh_studio.app.document import Document
 from dbh_studio.app.jobs import Job, run_job
 from dbh_studio.app.opening import open_plot, plot_name, read_cloud
 from dbh_studio.app.session import Change, Session
-from dbh_studio.core.arrays import Int32, Int64
 from dbh_studio.core.progress import Progress
 from dbh_studio.core.reconstruction import Reconstruction
-from dbh_studio.errors import CancelledError, StudioError
+from dbh_studio.errors import CancelledError, FileError, ProjectError, StudioError
 from dbh_studio.io.project import FOLDER_SUFFIX, is_project
 from dbh_studio.io.reader import SUPPORTED_SUFFIXES
 from dbh_studio.ui.bind import TabWorker, for_each_tab
 from dbh_studio.ui.display_cloud import DisplayCloud
+from dbh_studio.ui.marker_search import MarkerFinds
+from dbh_studio.ui.photo_desk import PhotoDesk
+from dbh_studio.ui.photo_render import PhotoCache
 from dbh_studio.ui.server import StudioServer
 from dbh_studio.ui.tab import Tab
 from dbh_studio.ui.uploads import UploadedFile, receive
@@ -36,13 +39,20 @@ from dbh_studio.ui.uploads import UploadedFile, receive
 log = logging.getLogger(__name__)
 
 DEFAULT_DISPLAY_POINTS = 3_000_000
+# Bytes of a saved plot's name; file systems allow 255 with the suffix.
+_LONGEST_NAME = 200
 
 
-@dataclass(frozen=True)
-class JobState:
-    """What the progress bar shows."""
+class BusyError(StudioError):
+    """Another job is running."""
+
+
+@dataclass(eq=False)
+class RunningJob:
+    """What the progress bar shows and Cancel stops."""
 
     title: str
+    stop: Callable[[], object]
     fraction: float = 0.0
     message: str = ""
 
@@ -63,13 +73,17 @@ class Studio:
         self.session: Session | None = None
         self.display: DisplayCloud | None = None
         self.segmentation_notes: tuple[str, ...] = ()
+        self.markers = MarkerFinds(self)
         self._uploads_folder = uploads_folder or Path(platformdirs.user_data_dir("dbh-studio")) / "plots"
         self._display_points = display_points
         self._tabs: dict[int, Tab] = {}
-        self._job: JobState | None = None
-        self._stop_job: Callable[[], object] | None = None
+        self._job: RunningJob | None = None
+        self._end_session: Callable[[], None] = lambda: None
+        self._problem_told = ""
         self._exported: Document | None = None
         self._lock = threading.RLock()
+        self.photo_cache = PhotoCache()
+        self.photos = PhotoDesk(self, run=self.start_job, tell=self._each_tab)
         server.viser.initial_camera.position = (0.0, -20.0, 6.0)
         server.viser.initial_camera.look_at = (0.0, 0.0, 1.0)
         server.viser.gui.main_panel.dock_right()
@@ -82,14 +96,20 @@ class Studio:
 
     def _tab_opened(self, worker: TabWorker) -> None:
         tab = Tab(self, worker)
+        # Before it shows the plot: a change from now on waits in its queue, and none is missed.
         with self._lock:
             self._tabs[worker.client.client_id] = tab
         worker.on_close(lambda: self._forget_tab(worker.client.client_id))
+        tab.adopt_session()
         tab.show_job(self._job)
 
     def _forget_tab(self, client_id: int) -> None:
         with self._lock:
             self._tabs.pop(client_id, None)
+
+    def refresh_tabs(self) -> None:
+        """Show in every tab what has changed beside the document."""
+        self._each_tab(Tab.refresh)
 
     def _each_tab(self, action: Callable[[Tab], Any]) -> None:
         with self._lock:
@@ -100,18 +120,41 @@ class Studio:
     # ---- the open plot
 
     def adopt(self, session: Session) -> None:
-        """Show this plot in every tab, in place of the one that is open."""
+        """Show this plot in every tab, in place of the one that is open.
+
+        Raises:
+            ProjectError: The last changes of the open plot cannot be saved, so it stays open.
+        """
         display = self._make_display(session)
+        self._save_open_plot()
+        end = session.subscribe(partial(self._session_changed, session))
         with self._lock:
             before, self.session, self.display = self.session, session, display
-            self.segmentation_notes, self._exported = (), None
+            end_before, self._end_session = self._end_session, end
+            # At one go: what a person starts in the new plot must not find the opening of it, or the old one's job.
+            job, self._job = self._job, None
+            self.segmentation_notes, self._exported, self._problem_told = (), None, ""
+        if job is not None:
+            job.stop()
+        end_before()
         if before is not None:
             before.close()
-        session.subscribe(self._session_changed)
         if isinstance(session.saver, Autosave):
             session.saver.subscribe(self._save_status_changed)
+        self._show_job()
         self._each_tab(Tab.adopt_session)
+        self.photos.plot_opened(session)
         self.measure_missing()
+
+    def _save_open_plot(self) -> None:
+        """Raise ProjectError where the open plot cannot be saved: closing it would lose what was done."""
+        try:
+            if self.session is not None:
+                self.session.flush()
+        except ProjectError as error:
+            raise ProjectError(
+                f"The open plot is kept, for it could not be saved: {error.problem}", error.remedy
+            ) from None
 
     def _make_display(self, session: Session) -> DisplayCloud:
         return DisplayCloud.of(
@@ -121,47 +164,41 @@ class Studio:
             is_metric=session.document.scale.is_known,
         )
 
-    def _session_changed(self, change: Change) -> None:
-        session = self.session
-        if session is None:
+    def _session_changed(self, session: Session, change: Change) -> None:
+        if session is not self.session:
             return
-        if change.before.scale != change.after.scale or change.before.up_direction != change.after.up_direction:
+        if change.moves_points:
             self.display = self._make_display(session)
+        self.photos.follow(session)
         self._each_tab(lambda tab: tab.session_changed(change))
         self.measure_missing()
 
     def _save_status_changed(self, status: SaveStatus) -> None:
-        self._each_tab(Tab.refresh_header)
-        if status.state == "not_saved":
+        with self._lock:
+            tabs = list(self._tabs.values())
+        for tab in tabs:
+            tab.worker.post_latest("saved", tab.refresh_header)
+        # Told once: with every edit it fails again, and the header says so all the time.
+        if status.state == "saved":
+            self._problem_told = ""
+        elif status.state == "not_saved" and status.problem != self._problem_told:
+            self._problem_told = status.problem
             self._each_tab(lambda tab: tab.worker.notify("Not saved", status.problem, "error"))
 
     def saved_text(self) -> str:
-        """Where the plot is saved, or that it is not, in a few words."""
+        """Where the plot is saved, in a few words."""
         session = self.session
         if session is None:
             return ""
         saver = session.saver
         if not isinstance(saver, Autosave):
             return "open for reading, changes are not saved"
-        if saver.status.state == "not_saved":
-            return f"NOT SAVED: {saver.status.problem}"
         return f"saved in {saver.folder.name}" if saver.status.state == "saved" else "saving …"
 
-    def trunk_ids_at(self, rows: Int64) -> Int32:
-        """(K,) trunk id of (K,) points of the display cloud, 0 where none.
-
-        Looked up for the few points under a click: labels of the whole cloud would cost the first click after every
-        edit a tenth of a second for ten million points.
-        """
-        session, display = self.session, self.display
-        assert session is not None and display is not None
-        points = display.indices[rows].astype(np.int32)
-        ids = np.zeros(len(points), np.int32)
-        for trunk in session.document.trunks:
-            if len(trunk):
-                at = np.minimum(np.searchsorted(trunk.points, points), len(trunk) - 1)
-                ids[trunk.points[at] == points] = trunk.id
-        return ids
+    def save_problem(self) -> str:
+        """Why the plot is not saved; empty where it is."""
+        saver = self.session.saver if self.session is not None else None
+        return saver.status.problem if isinstance(saver, Autosave) else ""
 
     def exported(self, document: Document) -> None:
         """Remember which state of the plot was handed in."""
@@ -184,32 +221,40 @@ class Studio:
 
     def cancel_job(self) -> None:
         """Stop what runs; nothing of it is kept."""
-        stop = self._stop_job
-        if stop is not None:
-            stop()
+        job = self._job
+        if job is not None:
+            job.stop()
 
     def open_plot(self, path: Path, **options: Any) -> None:
-        """Read a plot in the background and show it. `options` as for `pipeline.open_plot`."""
+        """Read a plot in the background and show it. `options` as for `pipeline.open_plot`.
+
+        Raises:
+            StudioError: It is open already, the open plot cannot be saved, or another job runs.
+        """
+        options.setdefault("project_dir", None if is_project(path) else self.project_dir_for(path))
+        self._check_not_open(path, options["project_dir"] or path)
+        self._save_open_plot()
         cancelled = threading.Event()
-        self._claim(f"Opening {path.name}", cancelled.set)
-        threading.Thread(target=self._open, args=(path, options, cancelled), daemon=True, name="open").start()
+        job = RunningJob(f"Opening {path.name}", cancelled.set)
+        self._claim(job)
+        threading.Thread(target=self._open, args=(job, path, options, cancelled), daemon=True, name="open").start()
 
-    def open_upload(self, uploaded: UploadedFile) -> None:
-        """Keep an uploaded file and open it."""
-        self.open_plot(receive(uploaded, self._uploads_folder, allowed_suffixes=self.suffixes()))
+    def keep_upload(self, uploaded: UploadedFile) -> Path:
+        """Where an uploaded file is kept from now on."""
+        return receive(uploaded, self._uploads_folder, allowed_suffixes=self.suffixes())
 
-    def _open(self, path: Path, options: dict[str, Any], cancelled: threading.Event) -> None:
+    def _open(self, running: RunningJob, path: Path, options: dict[str, Any], cancelled: threading.Event) -> None:
         def progress(fraction: float, message: str = "") -> None:
             if cancelled.is_set():
                 raise CancelledError
-            self._show_progress(fraction, message)
+            self._show_progress(running, fraction, message)
 
         def started(job: Job) -> None:
             def stop() -> None:
                 cancelled.set()
                 job.cancel()
 
-            self._stop_job = stop
+            running.stop = stop
             if cancelled.is_set():
                 job.cancel()
 
@@ -217,33 +262,36 @@ class Studio:
             return run_job(read_cloud, source, progress=progress, started=started)
 
         try:
-            options.setdefault("project_dir", None if is_project(path) else self.project_dir_for(path))
-            self._release(path, options["project_dir"])
             session = open_plot(path, progress=progress, read=read, **options)
-            # Before the plot is shown: what a person then starts must not find this still running.
-            self._end_job()
-            self.adopt(session)
+            try:
+                self.adopt(session)
+            except BaseException:
+                session.close()
+                raise
         except StudioError as error:
-            self._tell_failure(f"Opening {path.name}", error)
+            self._fail(running, error)
+            self.measure_missing()
         except Exception:
             log.exception("Opening %s failed", path)
-            self._each_tab(
-                lambda tab: tab.worker.notify("Unexpected error", "The program's log has the details.", "error")
-            )
-        finally:
-            self._end_job()
+            self._fail(running, StudioError("Unexpected error.", "The program's log has the details."))
 
     def project_dir_for(self, path: Path) -> Path:
         """Where a plot made from `path` is saved."""
         return project_dir_for(path, self._uploads_folder)
 
-    def _release(self, path: Path, project_dir: Path | None) -> None:
-        """Let go of the open plot if it is the very one to be opened again: a plot has one writer."""
+    def _check_not_open(self, path: Path, folder: Path) -> None:
+        """Raise StudioError where a plot would be saved in the folder of the open one: a plot has one writer."""
         session = self.session
         saver = session.saver if session is not None else None
-        wanted = path if is_project(path) else project_dir
-        if isinstance(saver, Autosave) and wanted is not None and saver.folder.absolute() == wanted.absolute():
-            saver.close()
+        if session is None or not isinstance(saver, Autosave) or saver.folder.resolve() != folder.resolve():
+            return
+        source = session.document.source.path
+        if path == folder or path.resolve() == source.resolve():
+            raise StudioError(f"{path.name} is open already.", "What you change is saved as you go.")
+        raise StudioError(
+            f"{path.name} would be saved in {folder.name}, where the open plot of {source.name} is.",
+            "Rename one of the two files.",
+        )
 
     def find_trunks(self) -> None:
         """Find the trunks of the open plot in a child process; the result is one undoable command."""
@@ -252,12 +300,18 @@ class Studio:
         call = pipeline.segmentation_call(session, document)
 
         def done(result: pipeline.SegmentationResult) -> None:
-            self.segmentation_notes = result[2]
-            pipeline.apply_segmentation(session, document, result)
+            before, self.segmentation_notes = self.segmentation_notes, result[2]
+            try:
+                pipeline.apply_segmentation(session, document, result)
+            except StudioError:
+                self.segmentation_notes = before
+                raise
             if session.document is document:
                 self._each_tab(Tab.refresh)
 
-        self._run_job("Finding trunks", pipeline.segment_plot, call, done)
+        self.start_job(
+            "Finding trunks", pipeline.segment_plot, call, session, done, failed=lambda _: self.measure_missing()
+        )
 
     def measure_missing(self) -> None:
         """Measure in the background the stems that have no measurement yet; nothing where there are none."""
@@ -265,70 +319,85 @@ class Studio:
         if session is None or self._job is not None or not session.unmeasured():
             return
         document = session.document
-        if not session.has_ground():
-            self._run_job(
-                "Fitting the ground",
-                pipeline.ground_of,
-                pipeline.ground_call(session, document),
-                self._ground_fitted(document),
-            )
-            return
 
-        def done(measurements: Any) -> None:
+        def measured(measurements: Any) -> None:
             session.remember_measurements(document, measurements)
-            self._each_tab(Tab.refresh)
+            self._each_tab(Tab.measured)
 
-        self._run_job("Measuring", pipeline.measure_stems, pipeline.measurement_call(session, document), done)
-
-    def _ground_fitted(self, document: Document) -> Callable[[Any], None]:
-        session = self._require_session()
-        return lambda ground: session.remember_ground(document, ground)
+        with contextlib.suppress(BusyError):  # whatever runs goes on with this when it ends
+            if session.has_ground():
+                call = pipeline.measurement_call(session, document)
+                self.start_job("Measuring", pipeline.measure_stems, call, session, measured)
+            else:
+                fitted = partial(session.remember_ground, document)
+                ground_call = pipeline.ground_call(session, document)
+                self.start_job("Fitting the ground", pipeline.ground_of, ground_call, session, fitted)
 
     def _require_session(self) -> Session:
         if self.session is None:
             raise StudioError("No plot is open.", "Open one in step 1.")
         return self.session
 
-    def _run_job(
-        self, title: str, function: Callable[..., Any], args: tuple[Any, ...], done: Callable[[Any], None]
+    def start_job(
+        self,
+        title: str,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        session: Session,
+        done: Callable[[Any], None],
+        *,
+        failed: Callable[[StudioError], object] = lambda _: None,
     ) -> None:
-        def finished(result: Any) -> None:
+        """Run `function` in a child process, then `done` with its result if `session` is still the open plot.
+
+        Raises:
+            BusyError: Another job runs.
+        """
+
+        def finish(result: Any) -> None:
             # The bar goes first: what `done` changes may start the next job.
-            self._end_job()
-            done(result)
+            self._end(running)
+            if session is self.session:
+                done(result)
             self.measure_missing()
 
-        def failed(error: StudioError) -> None:
-            self._end_job()
-            self._tell_failure(title, error)
+        def fail(error: StudioError) -> None:
+            self._fail(running, error)
+            failed(error)
 
-        job = Job(function, args, on_progress=self._show_progress, on_done=finished, on_error=failed)
+        def progress(fraction: float, message: str = "") -> None:
+            self._show_progress(running, fraction, message)
+
+        job = Job(function, args, on_progress=progress, on_done=finish, on_error=fail)
         # Claimed before it starts: a Cancel pressed while the process is being made counts.
-        self._claim(title, job.cancel)
+        running = RunningJob(title, job.cancel)
+        self._claim(running)
         job.start()
 
-    def _tell_failure(self, title: str, error: StudioError) -> None:
+    def _fail(self, job: RunningJob, error: StudioError) -> None:
+        self._end(job)
         if isinstance(error, CancelledError):
-            self._each_tab(lambda tab: tab.worker.notify("Cancelled", f"{title}: nothing was changed.", "info"))
+            self._each_tab(lambda tab: tab.worker.notify("Cancelled", f"{job.title}: nothing was changed.", "info"))
         else:
             self._each_tab(lambda tab: tab.worker.notify_error(error))
 
-    def _claim(self, title: str, stop: Callable[[], object]) -> None:
+    def _claim(self, job: RunningJob) -> None:
         with self._lock:
             if self._job is not None:
-                raise StudioError(f"{self._job.title} is still running.", "Wait for it, or press Cancel.")
-            self._job, self._stop_job = JobState(title), stop
+                raise BusyError(f"{self._job.title} is still running.", "Wait for it, or press Cancel.")
+            self._job = job
         self._show_job()
 
-    def _show_progress(self, fraction: float, message: str = "") -> None:
-        with self._lock:
-            if self._job is not None:
-                self._job = replace(self._job, fraction=fraction, message=message)
+    def _show_progress(self, job: RunningJob, fraction: float, message: str = "") -> None:
+        job.fraction, job.message = fraction, message
         self._show_job()
 
-    def _end_job(self) -> None:
+    def _end(self, job: RunningJob) -> None:
+        """Let go of the claim, unless it is another's by now."""
         with self._lock:
-            self._job, self._stop_job = None, None
+            if self._job is not job:
+                return
+            self._job = None
         self._show_job()
 
     def _show_job(self) -> None:
@@ -350,18 +419,31 @@ class Studio:
     def close(self) -> None:
         """Stop the job, save the plot, end the server."""
         self.cancel_job()
+        self.photos.close()
         if self.session is not None:
             self.session.close()
         self.server.stop()
 
 
 def project_dir_for(path: Path, fallback: Path) -> Path:
-    """Where the plot of a source file is saved: beside it, or in `fallback` where that folder is not writable."""
-    name = f"{plot_name(path)}{FOLDER_SUFFIX}"
-    beside = path.absolute().parent / name
+    """Where the plot of a source file is saved: beside it, or in `fallback` where that folder is not writable.
+
+    Raises:
+        FileError: `fallback` cannot be made.
+    """
+    absolute = path.absolute()
+    # Two plots of one name in two read-only folders, or of one long beginning, must not share a saved plot.
+    digest = hashlib.blake2b(str(absolute).encode("utf-8", "replace"), digest_size=4).hexdigest()
+    encoded = plot_name(path).encode("utf-8", "replace")
+    name = encoded[:_LONGEST_NAME].decode("utf-8", "ignore")
+    with_digest = f"{name}-{digest}{FOLDER_SUFFIX}"
+    beside = absolute.parent / (with_digest if len(encoded) > _LONGEST_NAME else f"{name}{FOLDER_SUFFIX}")
     if beside.exists() or os.access(beside.parent, os.W_OK):
         return beside
-    # Two plots of one name in two read-only folders must not share a saved plot.
-    digest = hashlib.blake2b(str(path.absolute()).encode(), digest_size=4).hexdigest()
-    fallback.mkdir(parents=True, exist_ok=True)
-    return fallback / f"{beside.stem}-{digest}{FOLDER_SUFFIX}"
+    try:
+        fallback.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(
+            path, f"There is no place to save its plot: {error.strerror or error}.", f"Make {fallback} writable."
+        ) from None
+    return fallback / with_digest

@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from dbh_studio.app.document import Document
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.arrays import Float32, Float64
 from dbh_studio.core.dbh import CurveFit, DbhEstimate
+from dbh_studio.core.trunks import Trunk
 from dbh_studio.errors import StudioError
 from dbh_studio.settings import Settings
 from dbh_studio.ui import html
 from dbh_studio.ui.bind import SceneClick, TabWorker
 from dbh_studio.ui.bridge import Bridge
+from dbh_studio.ui.camera_layer import CameraLayer
+from dbh_studio.ui.marking import Marking
 from dbh_studio.ui.panels.base import Panel, set_content
 from dbh_studio.ui.panels.export import ExportPanel
 from dbh_studio.ui.panels.inspect import InspectPanel, row_of
 from dbh_studio.ui.panels.open import OpenPanel
 from dbh_studio.ui.panels.scale import ScalePanel
 from dbh_studio.ui.panels.trunks import TrunksPanel
-from dbh_studio.ui.scene import SceneView
+from dbh_studio.ui.photo_view import PhotoView
+from dbh_studio.ui.scene import SceneView, TrunkPicture
 from dbh_studio.ui.steps import PlotStatus, StepName
 from dbh_studio.ui.view_controls import ViewControls
 from dbh_studio.ui.view_state import ViewState
 
 if TYPE_CHECKING:
-    from dbh_studio.ui.studio import JobState, Studio
+    from dbh_studio.stages.measure import StemMeasurement
+    from dbh_studio.ui.studio import RunningJob, Studio
 
 log = logging.getLogger(__name__)
 
@@ -36,14 +43,14 @@ _MIN_SHARE = 0.2
 
 
 class Tab:
-    """Builds the panel of one client and keeps it in step with the plot."""
+    """Builds the panel of one client and keeps it in step with the plot; `adopt_session` shows the plot."""
 
     def __init__(self, studio: Studio, worker: TabWorker) -> None:
         self.studio = studio
         self.worker = worker
         self.client = worker.client
         self.bridge = Bridge(worker)
-        self.scene = SceneView(self.client)
+        self.scene = SceneView(self.client, is_hurried=lambda: worker.is_behind)
         self.view = ViewState()
         self._build()
         self.bridge.on("step", self._step_chosen)
@@ -51,12 +58,12 @@ class Tab:
         self.bridge.on("sort", self._sort_chosen)
         self.bridge.on("undo", lambda _: self._undo_pressed())
         self.bridge.on("redo", lambda _: self._redo_pressed())
-        self.bridge.on("cancel", lambda _: self.studio.cancel_job())
+        # At once: what fills the queue may be waiting for the very job.
+        self.bridge.on("cancel", lambda _: self.studio.cancel_job(), at_once=True)
         self.bridge.on("measure", lambda _: self.studio.measure_missing())
         self.bridge.on("neighbour", lambda n: self._step_tree(1 if n == 1 else -1))
         worker.on_scene_click(self.client, self._scene_clicked)
         worker.on_close(self.scene.stop)
-        self.adopt_session()
 
     # ---- building
 
@@ -65,6 +72,9 @@ class Tab:
         self.bridge.run(html.style_js())
         self._header = gui.add_html("")
         self._job_box = gui.add_html("", visible=False)
+        self.photos = PhotoView(self)
+        self.cameras = CameraLayer(self)
+        self.marking = Marking(self)
         self.panels: tuple[Panel, ...] = tuple(
             panel(self) for panel in (OpenPanel, ScalePanel, TrunksPanel, InspectPanel, ExportPanel)
         )
@@ -82,6 +92,7 @@ class Tab:
             ("Next colours", "C", None, self.controls.next_mode),
             ("Look from the top", "T", None, self.scene.look_from_top),
             ("Whole plot", "H", None, self.scene.look_at_plot),
+            ("Stop marking", "escape", None, self.marking.stop),
         ):
             self.worker.add_command(label, action, hotkey=key, modifier=modifier)
 
@@ -105,6 +116,7 @@ class Tab:
     def adopt_session(self) -> None:
         """Show the plot that is open now from scratch: on connect, and after another one was opened."""
         self.view.selected, self.view.n_inspected = None, 0
+        self.photos.close()
         self.view.step = self.status().next_step()
         session = self.session
         check = session.data_check if session is not None else None
@@ -122,31 +134,44 @@ class Tab:
         display = self.studio.display
         if display is None:
             self.scene.show_nothing_open()
+            self.cameras.refresh()
             return
-        self.scene.show_plot(display)
-        self.controls.show_plot()
+        if not self.scene.shows(display):  # after a row of changes the first of them has sent the last one's cloud
+            self.scene.show_plot(display)
         self.refresh_trunks()
+        self.cameras.refresh()
+        self.controls.show_plot()
 
     def session_changed(self, change: Change) -> None:
         """Follow one change of the document."""
-        if self.view.selected is not None and self.view.selected not in change.after.trunks:
+        session = self.session
+        if session is None:
+            return
+        # Not those of the change: others may have followed while it waited.
+        if self.view.selected not in session.document.trunks:
             self.view.selected = None
-        frame_moved = (
-            change.before.scale != change.after.scale or change.before.up_direction != change.after.up_direction
-        )
         self.refresh()
         self.client.flush()
-        if frame_moved:
+        if change.moves_points:
             self.show_cloud()
         elif change.before is not change.after:
             self.refresh_trunks()
+            self.cameras.refresh()
+        self.photos.refresh()
         if change.before.trunks is not change.after.trunks and len(change.before.trunks) == 0:
             self._trunks_appeared()
 
+    def photos_changed(self) -> None:
+        """Show photos that have just been found or read."""
+        self.refresh()
+        self.cameras.refresh()
+        self.photos.refresh()
+
     def _trunks_appeared(self) -> None:
-        """The first trunks of a plot: show them and go on to the next step."""
+        """The first trunks of a plot: show them, to be looked through."""
         self._show_in_red()
-        self.go_to_next_step()
+        self.view.step = "inspect"
+        self.refresh()
 
     def _show_in_red(self) -> None:
         if self.view.mode == "Original":
@@ -158,8 +183,10 @@ class Tab:
         if session is None:
             return PlotStatus()
         document = session.document
-        waiting = set(session.unmeasured())
-        measured = [i for i in document.trunks.ids if i not in waiting and session.measurement(i).result]
+        waiting = set(session.unmeasured(document))
+        measured = [
+            i for i in document.trunks.ids if i not in waiting and session.measurement(i, document=document).result
+        ]
         return PlotStatus(
             has_plot=True,
             is_scaled=document.scale.is_known,
@@ -168,6 +195,7 @@ class Tab:
             n_waiting=len(waiting),
             n_inspected=self.view.n_inspected,
             is_exported=self.studio.is_exported(),
+            has_photos=session.cameras is not None,
         )
 
     # ---- showing
@@ -182,6 +210,11 @@ class Tab:
                     panel.refresh()
                 panel.show(is_active)
 
+    def measured(self) -> None:
+        """Show diameters that have just been measured."""
+        self.refresh()
+        self._refresh_highlight()
+
     def refresh_header(self) -> None:
         """Plot name, steps, hint."""
         session = self.session
@@ -190,6 +223,7 @@ class Tab:
             self.status(),
             self.view.step,
             saved=self.studio.saved_text(),
+            problem=self.studio.save_problem(),
             undo=session.undo_label if session is not None else "",
             redo=session.redo_label if session is not None else "",
             is_busy=self._job_box.visible,
@@ -201,27 +235,35 @@ class Tab:
         session = self.session
         if session is None or self.studio.display is None:
             return
-        points_world, rgb = session.points_world(), session.cloud.rgb
-        shown = {}
-        for trunk in session.document.trunks:
-            points = points_world[trunk.points]
-            shown[trunk.id] = (trunk, points, None if rgb is None else rgb[trunk.points], _label_anchor(points))
-        self.scene.show_trunks(shown)
+        document = session.document
+        self.scene.show_trunks(tuple(document.trunks), partial(self._picture_of, session, document))
         self._refresh_highlight()
+
+    @staticmethod
+    def _picture_of(session: Session, document: Document, trunk: Trunk) -> TrunkPicture:
+        points, rgb = session.points_world(document)[trunk.points], session.cloud.rgb
+        return TrunkPicture(points, None if rgb is None else rgb[trunk.points], _label_anchor(points))
 
     def _refresh_highlight(self) -> None:
         session, selected = self.session, self.view.selected
-        if session is None or selected is None:
-            self.scene.highlight(None, None, None)
+        document = session.document if session is not None else None
+        if session is None or document is None or selected is None or selected not in document.trunks:
+            self.scene.highlight(None)
             return
-        rows, rgb = session.document.trunks[selected].points, session.cloud.rgb
-        own_rgb = None if rgb is None else rgb[rows]
-        self.scene.highlight(session.points_world()[rows], own_rgb, self._ring_world(selected))
+        picture = self._picture_of(session, document, document.trunks[selected])
+        self.scene.highlight(picture, self._ring_world(self.stem(document, selected)))
 
-    def _ring_world(self, trunk_id: int) -> Float32 | None:
+    def stem(self, document: Document, trunk_id: int) -> StemMeasurement | None:
+        """A stem of the plot; None while the ground is still being fitted, which may take long."""
+        session = self.require_session()
+        is_waiting = document.scale.is_known and not session.has_ground()
+        if is_waiting and trunk_id in session.unmeasured(document):
+            return None
+        return session.measurement(trunk_id, document=document)
+
+    def _ring_world(self, stem: StemMeasurement | None) -> Float32 | None:
         """(M, 3) outline of the measured curve in the world frame."""
-        stem = self.require_session().measurement(trunk_id)
-        if not isinstance(stem.result, DbhEstimate):
+        if stem is None or not isinstance(stem.result, DbhEstimate):
             return None
         fit = stem.result.fits[stem.result.curve]
         if not isinstance(fit, CurveFit):
@@ -234,7 +276,7 @@ class Tab:
         ring = stem.result.section.stem_from_section.apply(flat)
         return (ring + np.array([0.0, 0.0, stem.z_ground_m])).astype(np.float32)
 
-    def show_job(self, job: JobState | None) -> None:
+    def show_job(self, job: RunningJob | None) -> None:
         """Show the running job, or that none runs."""
         with self.client.atomic():
             if job is not None:
@@ -253,14 +295,15 @@ class Tab:
         session = self.session
         if session is None:
             return []
-        document, waiting = session.document, set(session.unmeasured())
+        document = session.document
+        waiting = set(session.unmeasured(document))
         rows = []
         for trunk_id in document.trunks.ids:
             record = document.record(trunk_id)
             if trunk_id in waiting:
                 rows.append(html.TableRow(trunk_id, None, "", None, "not measured yet"))
             else:
-                result = session.measurement(trunk_id).result
+                result = session.measurement(trunk_id, document=document).result
                 rows.append(row_of(trunk_id, result, species=record.species, note=record.note))
         return rows
 
@@ -272,7 +315,10 @@ class Tab:
         self.refresh()
 
     def select(self, trunk_id: int | None, *, fly: bool = False) -> None:
-        """Choose a tree: text first, then the row, then the picture."""
+        """Choose a tree: text first, then the row, then the picture. What was typed about the last one is kept."""
+        if trunk_id != self.view.selected:
+            for panel in self.panels:
+                panel.leave_tree()
         self.view.selected = trunk_id
         if trunk_id is not None:
             self.view.n_inspected += 1
@@ -285,12 +331,14 @@ class Tab:
 
     def _scene_clicked(self, click: SceneClick) -> None:
         session, display = self.session, self.studio.display
-        if session is None or display is None:
+        if session is None or display is None or self.marking.scene_clicked(click):
             return
         hit = display.picking.pick(click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
-        if hit is None:
+        if self.cameras.click(click, hit.depth if hit is not None else np.inf) or hit is None:
             return
-        labels = self.studio.trunk_ids_at(hit.surface)
+        if self.marking.is_on:
+            return
+        labels = display.trunk_ids(hit.surface, session.document.trunks)
         ids, counts = np.unique(labels[labels > 0], return_counts=True)
         if len(ids) and counts.max() >= _MIN_SHARE * len(labels):
             self.select(int(ids[counts.argmax()]))
@@ -308,7 +356,7 @@ class Tab:
             self.select(payload, fly=True)
 
     def _sort_chosen(self, payload: Any) -> None:
-        if payload not in {column[0] for column in html.TABLE_COLUMNS}:
+        if payload not in [column[0] for column in html.TABLE_COLUMNS]:
             return
         if payload == self.view.sort_column:
             self.view.sort_descending = not self.view.sort_descending
@@ -326,20 +374,27 @@ class Tab:
     def fly_to_selected(self) -> None:
         """Look at the chosen tree at breast height; nothing where none is chosen."""
         session, selected = self.session, self.view.selected
-        if session is None or selected is None:
+        document = session.document if session is not None else None
+        if session is None or document is None or selected is None or selected not in document.trunks:
             return
-        stem = session.measurement(selected)
-        if isinstance(stem.result, DbhEstimate):
+        stem = self.stem(document, selected)
+        if stem is not None and isinstance(stem.result, DbhEstimate):
             target = np.array([*stem.xy_m, stem.z_ground_m + stem.result.section.hom_m])
         else:
-            target = np.median(session.points_world()[session.document.trunks[selected].points], axis=0).astype(float)
+            points = session.points_world(document)[document.trunks[selected].points]
+            target = np.median(points, axis=0).astype(float)
         self.scene.fly_to(target)
 
     def _undo_pressed(self) -> None:
-        self.require_session().undo()
+        if self.marking.take_back():  # the last thing that was done
+            return
+        # A key pressed once too often is no error.
+        if self.session is not None and self.session.can_undo:
+            self.session.undo()
 
     def _redo_pressed(self) -> None:
-        self.require_session().redo()
+        if self.session is not None and self.session.can_redo:
+            self.session.redo()
 
 
 def _label_anchor(points: Float32) -> Float64:

@@ -248,6 +248,6 @@ class UploadDesk:
             self._folder = None
 
     def _own_folder(self) -> Path:
-        if self._folder is None:
+        if self._folder is None or not self._folder.is_dir():  # systems sweep their temporary folders
             self._folder = Path(tempfile.mkdtemp(prefix="dbh-studio-uploads-"))
         return self._folder

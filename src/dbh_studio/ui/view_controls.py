@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from dbh_studio.errors import StudioError
 from dbh_studio.ui import html
-from dbh_studio.ui.panels.base import set_value
+from dbh_studio.ui.panels.base import set_value, set_visible
 from dbh_studio.ui.scene import COLOUR_MODES, MOST_FACES, ColourMode
 
 if TYPE_CHECKING:
@@ -41,6 +41,10 @@ class ViewControls:
                 "Mesh", False, visible=False, hint="the surface of the reconstruction, in place of the points"
             )
             worker.on_update(self._mesh, self._mesh_chosen)
+            self._cameras = gui.add_checkbox(
+                "Show cameras", True, visible=False, hint="where the photos were taken; click one to open it"
+            )
+            worker.on_update(self._cameras, tab.cameras.set_on)
             size = gui.add_slider("Point size", 0.3, 3.0, 0.1, 1.0)
             worker.on_update(size, scene.set_point_size, coalesce=True)
         tab.bridge.on("colours", self._mode_chosen)
@@ -67,6 +71,10 @@ class ViewControls:
         self._tab.scene.set_crowns(bool(self._crowns.value))
         if has_mesh and self._mesh.value:
             self._mesh_chosen(True)
+
+    def show_cameras(self, has_cameras: bool) -> None:
+        """Offer to hide the photos' places where there are any."""
+        set_visible(self._cameras, has_cameras)
 
     def _show_bar(self) -> None:
         self._tab.bridge.run(html.view_bar_js(tuple(_MODE_TITLES.items()), self._tab.view.mode, _LOOKS))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dbh_studio.errors import FileMissingError
 from dbh_studio.ui.steps import StepName
 
 if TYPE_CHECKING:
@@ -34,10 +37,12 @@ class Panel(ABC):
     def set_busy(self, busy: bool) -> None:  # noqa: B027 - most panels start nothing
         """Lock what cannot be started while a job runs."""
 
+    def leave_tree(self) -> None:  # noqa: B027 - most panels ask nothing about it
+        """Keep what was typed about the chosen tree: another one is about to be chosen."""
+
     def show(self, visible: bool) -> None:
         """Show or hide the whole panel."""
-        if self.folder.visible != visible:
-            self.folder.visible = visible
+        set_visible(self.folder, visible)
 
 
 def set_value(handle: Any, value: Any) -> None:
@@ -56,3 +61,25 @@ def set_disabled(handle: Any, disabled: bool) -> None:
     """Lock or release an input, where it is not so already."""
     if handle.disabled != disabled:
         handle.disabled = disabled
+
+
+def set_visible(handle: Any, visible: bool) -> None:
+    """Show or hide an element, where it is not so already."""
+    if handle.visible != visible:
+        handle.visible = visible
+
+
+def typed_path(text: str) -> Path | None:
+    """The path that was typed, on the computer the studio runs on; None where nothing was.
+
+    Raises:
+        FileMissingError: There is no such file or folder.
+    """
+    text = text.strip().strip("\"'")
+    if not text:
+        return None
+    # os.path, not pathlib: that one raises where a folder may not be entered or a name is too long.
+    path = Path(os.path.expanduser(text))  # noqa: PTH111
+    if not os.path.exists(path):  # noqa: PTH110
+        raise FileMissingError(path, "there is no such file or folder on this computer.", "Check the path.")
+    return path

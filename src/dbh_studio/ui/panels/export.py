@@ -5,6 +5,7 @@ from __future__ import annotations
 import viser
 
 from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.errors import StudioError
 from dbh_studio.io.inventory_csv import inventory_csv
 from dbh_studio.ui import html
 from dbh_studio.ui.panels.base import Panel, set_content
@@ -27,18 +28,23 @@ class ExportPanel(Panel):
         if session is None or not len(session.document.trunks):
             set_content(self._state, html.message("There is nothing to export yet: find the trunks first."))
             return
-        results = [session.measurement(i).result for i in session.document.trunks.ids if i not in session.unmeasured()]
+        document = session.document
+        waiting = set(session.unmeasured(document))
+        measured = [i for i in document.trunks.ids if i not in waiting]
+        results = [session.measurement(i, document=document).result for i in measured]
         diameters = [result.dbh_cm for result in results if isinstance(result, DbhEstimate)]
         n_without = len(results) - len(diameters)
         pairs = [
-            ("Trees", str(len(session.document.trunks))),
+            ("Trees", str(len(document.trunks))),
             ("With a diameter", str(len(diameters))),
             ("Without", f"{n_without} (the file says why)" if n_without else "0"),
         ]
+        if waiting:
+            pairs.append(("Not measured yet", str(len(waiting))))
         if diameters:
             mean = sum(diameters) / len(diameters)
             pairs += [("Mean DBH", f"{mean:.1f} cm"), ("Range", f"{min(diameters):.1f}–{max(diameters):.1f} cm")]
-        measure = session.document.settings.measure
+        measure = document.settings.measure
         pairs += [
             ("Breast height", f"{measure.breast_height_m:.2f} m"),
             ("Curve", html.CURVE_TITLES.get(measure.curve, measure.curve)),
@@ -48,7 +54,10 @@ class ExportPanel(Panel):
     def _export(self) -> None:
         session = self.tab.require_session()
         document = session.document
-        content = inventory_csv(session.inventory())
+        n_waiting = len(session.unmeasured(document))
+        if n_waiting:
+            raise StudioError(f"{n_waiting} trees are not measured yet.", "Wait for it, or press Measure above.")
+        content = inventory_csv(session.inventory(document=document))
         name = f"{document.plot_id}_inventory.csv"
         self.tab.client.send_file_download(name, content, save_immediately=True)
         self.tab.studio.exported(document)

@@ -8,13 +8,15 @@ from typing import Any, get_args
 import viser
 
 from dbh_studio.app import commands
+from dbh_studio.app.document import Document
+from dbh_studio.app.session import Session
 from dbh_studio.core.dbh import DbhEstimate
-from dbh_studio.core.inventory import TREE_STATUSES
+from dbh_studio.core.inventory import TREE_STATUSES, TreeRecord
 from dbh_studio.errors import CommandError
 from dbh_studio.settings import CurveName
 from dbh_studio.ui import html
 from dbh_studio.ui.forms import SettingsForm
-from dbh_studio.ui.panels.base import Panel, set_content, set_value
+from dbh_studio.ui.panels.base import Panel, set_content, set_value, set_visible
 from dbh_studio.ui.section_svg import section_svg
 
 _STATUS_TITLES = {"": "not said", "live": "live", "dead": "dead"}
@@ -65,30 +67,42 @@ class InspectPanel(Panel):
     def refresh_card(self) -> None:
         """Show the chosen tree: text first, so that it is there before the picture has turned."""
         session, selected = self.tab.session, self.tab.view.selected
-        if session is None or selected is None or selected not in session.document.trunks:
-            self._about.visible = False
-            set_content(self._card, html.no_tree_card() if session and len(session.document.trunks) else "")
+        document = session.document if session is not None else None
+        if document is None or selected is None or selected not in document.trunks:
+            set_visible(self._about, False)
+            set_content(self._card, html.no_tree_card() if document and len(document.trunks) else "")
+            self._record_shown = None
             return
-        result = session.measurement(selected).result
-        picture = section_svg(result, curve=session.document.settings.measure.curve)
-        set_content(self._card, html.tree_card(selected, result, section=picture))
-        self._show_record(selected)
+        stem = self.tab.stem(document, selected)
+        if stem is None:
+            set_content(self._card, html.waiting_card(selected))
+        else:
+            picture = section_svg(stem.result, curve=document.settings.measure.curve)
+            set_content(self._card, html.tree_card(selected, stem.result, section=picture))
+        self._show_record(document, selected)
 
     def refresh_table(self) -> None:
         """Show all trees; those not measured yet are left for the next refresh."""
         view = self.tab.view
         rows = self.tab.table_rows()
-        table = html.tree_table(rows, selected=view.selected, column=view.sort_column, descending=view.sort_descending)
         if self._rows_shown != (rows, view.sort_column, view.sort_descending):
             self._rows_shown = (rows, view.sort_column, view.sort_descending)
-            self._table.content = table
+            self._table.content = html.tree_table(
+                rows, selected=view.selected, column=view.sort_column, descending=view.sort_descending
+            )
         self.tab.bridge.run(html.select_row_js(view.selected))
 
     _rows_shown: object = None
+    _record_shown: tuple[Session, int, TreeRecord] | None = None
 
-    def _show_record(self, trunk_id: int) -> None:
-        record = self.tab.require_session().document.record(trunk_id)
-        self._about.visible = True
+    def _show_record(self, document: Document, trunk_id: int) -> None:
+        """Show what is said about a tree, unless it is there: a refresh must not take what is being typed."""
+        shown = (self.tab.require_session(), trunk_id, document.record(trunk_id))
+        set_visible(self._about, True)
+        if shown == self._record_shown:
+            return
+        self._record_shown = shown
+        record = shown[2]
         for handle, value in (
             (self._species, record.species),
             (self._status, _STATUS_TITLES[record.status]),
@@ -96,15 +110,27 @@ class InspectPanel(Panel):
         ):
             set_value(handle, value)
 
+    def leave_tree(self) -> None:
+        """Keep what was typed about the tree that was on screen, as the button Keep does."""
+        session, shown = self.tab.session, self._record_shown
+        if session is None or shown is None:
+            return
+        shown_session, trunk_id, record = shown
+        is_same_plot = shown_session is session and trunk_id in session.document.trunks
+        if is_same_plot and not session.is_read_only and replace(record, **self._typed()) != record:
+            session.do(commands.set_tree_record(trunk_id, **self._typed()))
+
     def _selected(self) -> int:
         if self.tab.view.selected is None:
             raise CommandError("No tree is chosen.", "Click a trunk first.")
         return self.tab.view.selected
 
-    def _keep_record(self) -> None:
+    def _typed(self) -> dict[str, Any]:
         status = next(key for key, title in _STATUS_TITLES.items() if title == self._status.value)
-        values = {"species": self._species.value.strip(), "status": status, "note": self._note.value.strip()}
-        self.tab.require_session().do(commands.set_tree_record(self._selected(), **values))
+        return {"species": self._species.value.strip(), "status": status, "note": self._note.value.strip()}
+
+    def _keep_record(self) -> None:
+        self.tab.require_session().do(commands.set_tree_record(self._selected(), **self._typed()))
 
     def _delete(self) -> None:
         self.tab.require_session().do(commands.delete_trunk(self._selected()))

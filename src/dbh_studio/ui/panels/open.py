@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import viser
 
 from dbh_studio.app import commands
+from dbh_studio.app.document import Direction, unit_direction
+from dbh_studio.app.session import Session
 from dbh_studio.core.transforms import UP_AXES
-from dbh_studio.errors import FileMissingError, StudioError
+from dbh_studio.errors import StudioError
 from dbh_studio.ui import html
-from dbh_studio.ui.panels.base import Panel, set_content, set_disabled, set_value
+from dbh_studio.ui.panels.base import Panel, set_content, set_disabled, set_value, set_visible, typed_path
 from dbh_studio.ui.uploads import UploadedFile
 
 _UP_AS_FOUND = "as recognised"
@@ -54,11 +54,14 @@ class OpenPanel(Panel):
     def refresh(self) -> None:
         """Show the data check of the open plot."""
         session = self.tab.session
-        self._up.visible = session is not None
+        set_visible(self._up, session is not None)
         if session is None:
             set_content(self._check, html.message(f"Reads {self.tab.studio.formats()}.", level="ok"))
             return
-        set_value(self._path, str(session.document.source.path))
+        if session is not self._session_shown:  # later refreshes leave alone what is being typed
+            self._session_shown = session
+            set_value(self._path, str(session.document.source.path))
+        set_value(self._up, _up_title(session))
         check = session.data_check
         items = [("note", note, "") for note in session.notes]
         verdict = ""
@@ -70,31 +73,45 @@ class OpenPanel(Panel):
             verdict = html.message(text, level=level)
         set_content(self._check, verdict + html.findings(items))
 
+    _session_shown: object = None
+
     def set_busy(self, busy: bool) -> None:
         """One plot at a time."""
         set_disabled(self._open_button, busy)
         set_disabled(self._upload, busy)
 
     def _open(self) -> None:
-        text = self._path.value.strip().strip("\"'")
-        if not text:
+        path = typed_path(self._path.value)
+        if path is None:
             raise StudioError("No file was named.", "Type the path of a cloud, or use Upload a cloud.")
-        path = Path(text).expanduser()
-        if not path.exists():
-            raise FileMissingError(path, "there is no such file or folder on this computer.", "Check the path.")
         self.tab.studio.open_plot(path)
 
     def _uploading(self, n_received: int, n_total: int) -> None:
-        self._upload_bar.visible = n_received < n_total
-        set_value(self._upload_bar, 100.0 * n_received / n_total)
+        set_visible(self._upload_bar, n_received < n_total)
+        set_value(self._upload_bar, 100.0 * n_received / max(n_total, 1))
 
     def _uploaded(self, uploaded: UploadedFile) -> None:
-        self._upload_bar.visible = False
-        self.tab.studio.open_upload(uploaded)
+        set_visible(self._upload_bar, False)
+        path = self.tab.studio.keep_upload(uploaded)
+        # Where something else runs it can be opened later, and need not be sent again.
+        set_value(self._path, str(path))
+        self.tab.studio.open_plot(path)
 
     def _set_up(self, choice: str) -> None:
         session = self.tab.session
         if session is None:
             return
-        recognised = session.data_check.up_direction_src if session.data_check is not None else (0.0, 0.0, 1.0)
-        session.do(commands.set_up(recognised if choice == _UP_AS_FOUND else choice))
+        session.do(commands.set_up(_recognised_up(session) if choice == _UP_AS_FOUND else choice))
+
+
+def _recognised_up(session: Session) -> Direction:
+    check = session.data_check
+    return unit_direction(check.up_direction_src if check is not None else (0.0, 0.0, 1.0))
+
+
+def _up_title(session: Session) -> str:
+    """The choice that stands for the plot's up direction as it is now: Undo and other tabs change it, too."""
+    up = session.document.up_direction
+    if up == _recognised_up(session):
+        return _UP_AS_FOUND
+    return next((axis for axis in UP_AXES if up == unit_direction(axis)), _UP_AS_FOUND)
