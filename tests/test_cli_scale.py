@@ -81,6 +81,13 @@ def test_markers_of_two_sizes_under_one_side_stop_the_run(photo_plot, tmp_path, 
     assert not list(tmp_path.rglob("*.csv")) and not list(tmp_path.rglob("project.json"))
 
 
+def test_only_the_marker_that_is_named_counts(photo_plot, capsys):
+    command = ["scale", photo_plot.cloud, "--dictionary", "4x4_50", "--dictionary", "apriltag_36h11"]
+    report = json.loads(succeeds(capsys, [*command, "--marker", "DICT_4X4_250:7=2", "--json"]))
+    assert [length["name"] for length in report["lengths"]] == ["DICT_4X4_50 7"]
+    assert report["metres_per_unit"] == pytest.approx(2 * photo_plot.metres_per_unit, rel=0.003)
+
+
 def test_wrong_requests_are_told_before_anything_is_searched(photo_plot, tmp_path, capsys):
     run = ["run", photo_plot.cloud, "--out", tmp_path, "--quiet"]
     assert "more than" in fails(capsys, ["scale", photo_plot.cloud, "--factor", 2, "--marker-side", 1], 2)

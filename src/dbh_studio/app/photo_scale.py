@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dbh_studio.stages.marker_detect import Detection
 
 # With these verdicts the number may be off by the size of a marker: a person must look before trees are measured by it.
-STOPPING_VERDICTS = frozenset({"inconsistent", "two_sizes"})
+STOPPING_VERDICTS = frozenset({"inconsistent", "default_side"})
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,14 @@ class PhotoRequest:
         sides: Side of the black square per marker, metres: by number (``7``) or dictionary and number
             (``DICT_4X4_50 7``); the others have that of `settings`.
         settings: Dictionaries, ids, side.
+        only_named: Ignore markers that `sides` does not name: a stand may carry others.
     """
 
     cameras: Path | None = None
     images_dir: Path | None = None
     sides: Mapping[str, float] = field(default_factory=dict)
     settings: MarkerSettings = MarkerSettings()  # noqa: RUF009 - frozen
+    only_named: bool = False
 
 
 def add_photos(
@@ -104,7 +106,8 @@ def scale_by_photos(
     sides = _sides(search.detections, request.sides)
     if sides:
         struck = session.document.evidence.struck
-        search = place_markers(search.detections, cameras.posed, sides, struck, request.settings)
+        believed = [each for each in search.detections if not request.only_named or each.key in sides]
+        search = place_markers(believed, cameras.posed, sides, struck, request.settings)
     verdict = search.report.verdict
     if verdict.code in STOPPING_VERDICTS:
         raise CommandError(verdict.message, verdict.remedy)

@@ -80,7 +80,8 @@ def add_photo_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         dest="markers",
         metavar="ID=M",
-        help="side of one marker, such as 12=0.5 or DICT_4X4_50:12=0.5; may be given several times",
+        help="side of one marker, such as 12=0.5 or DICT_4X4_50:12=0.5; may be given several times; without "
+        "--marker-side other markers are ignored",
     )
     photos.add_argument(
         "--dictionary",
@@ -109,7 +110,8 @@ def photo_request(options: argparse.Namespace) -> PhotoRequest | None:
     if options.marker_side is not None:
         changes["side_m"] = options.marker_side
     sides = dict(_marker_side(text) for text in options.markers)
-    return PhotoRequest(options.cameras, options.images, sides, MarkerSettings().changed(**changes))
+    only_named = bool(sides) and options.marker_side is None
+    return PhotoRequest(options.cameras, options.images, sides, MarkerSettings().changed(**changes), only_named)
 
 
 def _marker_side(text: str) -> tuple[str, float]:
