@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make the pictures of the guide again: the studio on the demo plot, in a browser without a window.
+"""Make the pictures of the guide again: the studio in a browser without a window, on the demo plot and one with photos.
 
     .venv/bin/python tools/guide_pictures.py                     # all of them
     .venv/bin/python tools/guide_pictures.py inspect export      # some
@@ -15,7 +15,8 @@ import io
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,10 @@ import numpy as np
 from PIL import Image, ImageColor
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "ui"))
+sys.path[:0] = [str(ROOT / "tests" / "ui"), str(ROOT)]
 
 import browser  # noqa: E402
+import scale_plots  # noqa: E402
 
 from dbh_studio.app.demo import demo_plot  # noqa: E402
 from dbh_studio.app.doctor import find_chromium  # noqa: E402
@@ -37,9 +39,10 @@ from dbh_studio.ui.server import start_server  # noqa: E402
 from dbh_studio.ui.studio import Studio  # noqa: E402
 
 SIZE = (1440, 900)
-LARGEST_BYTES = 300_000
+LARGEST_BYTES = 250_000
 PATIENCE_S = 300.0
 PANEL = "the panel"
+OF_SCALE = ("scale", "corners", "photos", "markers")
 # White, the three curves, the ring, the marks of good, fair, poor and refused, the bars of the hints.
 KEPT = [ImageColor.getrgb(c) for c in (
     "#ffffff", "#d9480f", "#0b7285", "#a61e8c", "#143cbe", "#2b8a3e", "#e8890c", "#c92a2a", "#868e96", "#f59f00",
@@ -84,6 +87,28 @@ class Photographer:
         browser.wait_for_points(self.page, int((~self.studio.display.is_crown).sum()))
         self.settle(1.0)
 
+    def until(self, condition: Callable[[], Any]) -> Any:
+        """Ask again and again until the answer is true."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not (answer := condition()):
+            if time.monotonic() > deadline:
+                raise SystemExit("What the picture is to show did not come to pass.")
+            time.sleep(0.1)
+        return answer
+
+    @property
+    def tab(self) -> Any:
+        """The page, as the studio knows it."""
+        (tab,) = self.studio._tabs.values()
+        return tab
+
+    def look_at(self, target: np.ndarray, away: np.ndarray) -> None:
+        """Look at a place of the cloud from another one."""
+        tab = self.tab
+        tab.worker.post(lambda: tab.scene._move(target + away, target, animate=False))
+        self.until(lambda: np.linalg.norm(np.asarray(tab.client.camera.position) - target - away) < 1e-3)
+        self.settle(1.0)
+
     def step(self, name: str) -> None:
         self.page.click(f"button[data-step={name}]")
         self.settle(1.5)
@@ -94,7 +119,11 @@ class Photographer:
 
     def show_path(self, text: str) -> None:
         """A path as a reader would type it, in place of the one on this computer."""
-        field = "//label[normalize-space()='File or folder']/ancestor::div[contains(@class,'mantine-Flex-root')][1]"
+        self.show_text("File or folder", text)
+
+    def show_text(self, label: str, text: str) -> None:
+        """Type into a field of the panel."""
+        field = f"//label[normalize-space()='{label}']/ancestor::div[contains(@class,'mantine-Flex-root')][1]"
         self.page.locator(f"{field}//input").first.fill(text)
 
 
@@ -102,7 +131,7 @@ def smallest(image: Image.Image) -> bytes:
     """PNG with as many colours as fit: points need few, the panel keeps its own, and what means something its hue."""
     panel = image.crop((int(0.73 * image.width), 0, image.width, image.height))
     own = panel.quantize(64, dither=Image.Dither.NONE).getpalette()[: 3 * 64]
-    for colours in (128, 96, 64, 40, 24):
+    for colours in (128, 96, 64, 40, 24, 16, 10):
         scene = image.quantize(colours, dither=Image.Dither.NONE).getpalette()[: 3 * colours]
         palette = Image.new("P", (1, 1))
         palette.putpalette([*np.ravel(KEPT).tolist(), *own, *scene])
@@ -122,14 +151,102 @@ def unscaled(demo: Path, folder: Path) -> Path:
     return path
 
 
+def of_scale(camera: Photographer, folder: Path) -> None:
+    """The ways to a scale, on a plot with two markers and the photos it was made from."""
+    page, studio = camera.page, camera.studio
+    # Denser than a test needs.
+    scale_plots._N_GROUND, scale_plots._N_STEMS = 60_000, 40_000
+    plots = folder / "plots"
+    plots.mkdir()
+    cloud = scale_plots.write_plot(plots)
+    camera.open(cloud)
+    camera.step("scale")
+    found = page.get_by_role("button", name="Show them", exact=True)
+    found.wait_for()
+    corners = scale_plots.plot().corners()
+    middle, side = corners.mean(axis=0), float(np.linalg.norm(corners[1] - corners[0]))
+    away = side * np.array([1.6, -7.5, 4.5])
+    camera.look_at(middle, away)
+    camera.take("scale")
+    found.click()
+    camera.until(lambda: studio.session is not None and studio.session.cameras is not None)
+    camera.settle()
+    clicked_corners(camera, corners, side)
+    camera.look_at(middle, away)
+    clicked_in_photos(camera, corners)
+    page.click("button[data-way=markers]")
+    page.get_by_role("button", name="Find markers in the photos", exact=True).click()
+    camera.until(lambda: studio.session is not None and studio.session.document.scale.is_known)
+    camera.settle()
+    page.locator(".dbh-markrow:has(button[data-do=use]) input").fill("0.50")
+    page.click("button[data-do=use]")
+    camera.until(lambda: studio.session is not None and len(studio.session.document.evidence) == 2)
+    camera.settle()
+    page.locator(".dbh-length .dbh-name").first.click()
+    scale = studio.session.document.scale.metres_per_unit if studio.session is not None else 1.0
+    camera.look_at(scale * middle, scale * away)
+    camera.take("markers")
+
+
+def clicked_corners(camera: Photographer, corners: np.ndarray, side: float) -> None:
+    """The corners of a marker in the cloud, with the close-up."""
+    page = camera.page
+    page.click("button[data-way=cloud]")
+    page.click("button[data-start=square]")
+    page.wait_for_selector("#dbh-banner")
+    camera.look_at(corners.mean(axis=0), side * np.array([0.1, -1.2, 2.4]))
+    for number, corner in enumerate(corners[:3]):
+        page.mouse.click(*browser.pixel_of(page, corner))
+        page.wait_for_selector(f"button[data-point='{number}'][data-kind=done]")
+    camera.settle()
+    camera.take("corners")
+    page.click(".dbh-markhead button[data-do=stop]")
+    camera.settle(1.0)
+
+
+def clicked_in_photos(camera: Photographer, corners: np.ndarray) -> None:
+    """A corner in one photo, its line of sight, and the photos offered next."""
+    page, tab = camera.page, camera.tab
+    page.click("button[data-way=photos]")
+    page.click("button[data-start=bar]")
+    page.click(".dbh-marking button[data-do=photo]")
+    camera.until(lambda: tab.photos.image is not None)
+    click_in_photo(camera, corners[0])
+    page.locator(".dbh-offers button").first.click()
+    camera.settle()
+    click_in_photo(camera, corners[0])
+    camera.settle()
+    camera.take("photos")
+    page.click(".dbh-markhead button[data-do=stop]")
+    page.click("#dbh-photo [data-photo=close]")
+    camera.settle(1.0)
+
+
+def click_in_photo(camera: Photographer, point: np.ndarray) -> None:
+    """Turn the open photo to a point of the cloud, and click it there."""
+    page, tab = camera.page, camera.tab
+    name = tab.photos.image
+    uv = scale_plots.plot().posed.by_name(name).project(point[None])[0][0]
+    tab.worker.post(lambda: tab.photos.open(name, at_px=(float(uv[0]), float(uv[1])), zoom_px=3.0))
+    camera.settle()
+    (x, y), _ = (np.asarray(part)[0] for part in tab.photos._look.view_from_photo([uv]))
+    box = page.locator("#dbh-photo .view").bounding_box()
+    look = tab.photos._look
+    page.mouse.click(box["x"] + x / look.width_px * box["width"], box["y"] + y / look.height_px * box["height"])
+    camera.settle(1.0)
+
+
 def tour(camera: Photographer, folder: Path) -> None:
     """The way of one plot from opening to export, as the guide tells it."""
     page, studio = camera.page, camera.studio
     demo = folder / "demo_plot.laz"
     shutil.copyfile(demo_plot().path, demo)
-    if not camera.wanted or "scale" in camera.wanted or "data-check-unscaled" in camera.wanted:
+    if not camera.wanted or set(camera.wanted) & set(OF_SCALE):
+        of_scale(camera, folder)
+    if camera.wanted and set(camera.wanted) <= set(OF_SCALE):
+        return
+    if not camera.wanted or "data-check-unscaled" in camera.wanted:
         camera.open(unscaled(demo, folder))
-        camera.take("scale")
         camera.step("open")
         camera.show_path("plots/from_video.ply")
         camera.take("data-check-unscaled", clip=PANEL)
