@@ -176,3 +176,15 @@ def test_the_table_never_takes_the_place_of_the_cloud(folder, tmp_path):
     with dbh_studio.open_plot(cloud) as plot, pytest.raises(FileError, match="read from it"):
         plot.write_csv(cloud)
     assert cloud.read_bytes() == (folder / "plot.laz").read_bytes()
+
+
+def test_the_scale_from_markers(photo_plot):
+    pytest.importorskip("cv2")
+    with dbh_studio.open_plot(photo_plot.cloud) as plot:
+        scale = plot.scale_by_markers(photo_plot.poses, sides_m={"DICT_4X4_50 7": 1.0})
+        assert scale.metres_per_unit == pytest.approx(photo_plot.metres_per_unit, rel=0.003)
+        assert scale.source == "marker" and 0 < scale.standard_error < 0.01 * scale.metres_per_unit
+        plot.find_trunks()
+        assert [row.dbh_cm for row in plot.inventory()] == pytest.approx([100 * d for _, _, d in STEMS], rel=0.02)
+        with pytest.raises(FileMissingError):
+            plot.scale_by_markers("nowhere")

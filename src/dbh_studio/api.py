@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from dbh_studio.app.session import Session
 from dbh_studio.core.inventory import Inventory
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.settings import MarkerSettings
 
 
 class Plot:
@@ -40,6 +42,46 @@ class Plot:
         """
         self.session.do(change_settings(section, **values))
         return self
+
+    def scale_by_markers(
+        self,
+        cameras: Path | str | None = None,
+        *,
+        images: Path | str | None = None,
+        side_m: float | None = None,
+        sides_m: Mapping[str, float] | None = None,
+        progress: Progress = ignore_progress,
+    ) -> ScaleEstimate:
+        """Take the scale from printed markers in the plot's photos; ``plot.session.document.evidence`` says on what.
+
+        Args:
+            cameras: The reconstruction with the photos' poses; None looks where the cloud is.
+            images: Folder of the photos; None looks beside the reconstruction.
+            side_m: Outer edge of the black squares. Without it, and with `sides_m`, other markers are ignored; without
+                both it is 1 m.
+            sides_m: Side per marker, by number (``"12"``) or dictionary and number (``"DICT_4X4_50 12"``).
+            progress: Called once per photo.
+
+        Returns:
+            Metres per unit and its standard error.
+
+        Raises:
+            FileError: The photos or their poses cannot be read.
+            CommandError: They do not belong to the cloud, or give no scale, or one that contradicts itself; says why.
+            SettingError: A marker of `sides_m` was not seen, or a side cannot be.
+        """
+        from dbh_studio.app.photo_scale import PhotoRequest, scale_by_photos
+
+        settings = MarkerSettings() if side_m is None else MarkerSettings().changed(side_m=side_m)
+        request = PhotoRequest(
+            cameras=None if cameras is None else Path(cameras),
+            images_dir=None if images is None else Path(images),
+            sides=dict(sides_m or {}),
+            settings=settings,
+            only_named=bool(sides_m) and side_m is None,
+        )
+        scale_by_photos(self.session, request, progress=progress)
+        return self.session.document.scale
 
     def find_trunks(self, *, progress: Progress = ignore_progress) -> tuple[str, ...]:
         """Find ground and trunks; returns notes in plain words.

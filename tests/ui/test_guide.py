@@ -8,6 +8,7 @@ import pytest
 import scale_plots
 from PIL import Image
 
+import dbh_studio
 from dbh_studio.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -70,7 +71,7 @@ def test_the_example_with_photos_runs_as_written(tmp_path, monkeypatch, capsys):
     scale_plots.write_plot(tmp_path)
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```py\n(.*?)```", (GUIDE / "python.md").read_text(encoding="utf-8"), re.DOTALL)
-    names = {}
+    names = {"dbh_studio": dbh_studio}
     exec(compile(code, "python.md", "exec"), names)
     scale = names["plot"].session.document.scale
     assert scale.source == "marker"

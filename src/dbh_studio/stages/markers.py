@@ -184,17 +184,17 @@ def measure_scale(
         progress=subprogress(progress, 0.0, 0.95 if len(posed) else 1.0),
     )
     if not detections and len(posed):
-        why = _why_none(posed, settings, read_image, subprogress(progress, 0.95, 1.0))
+        why = why_none(posed, settings, read_image, subprogress(progress, 0.95, 1.0))
         if why is not None:
             return MarkerScale(refused_scale(why.code, why.reason, why.remedy), (), ())
     progress(1.0, f"{len(detections)} sights of markers")
     return scale_from_detections(detections, posed, sides_m, settings=settings, left_out=left_out)
 
 
-def _why_none(
+def why_none(
     posed: PosedImages, settings: MarkerSettings, read_image: ReadImage, progress: Progress
 ) -> Refusal | None:
-    """What a few photos show where the search found nothing."""
+    """What a few photos show where the search found nothing; None where they show nothing of the kind either."""
     everything = Detector(all_dictionaries())
     photos = list(posed.images)
     some = [photos[i] for i in np.unique(np.linspace(0, len(photos) - 1, min(len(photos), _N_LAST_LOOK)).astype(int))]
