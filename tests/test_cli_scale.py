@@ -124,6 +124,11 @@ def test_a_marker_nobody_saw(photo_plot, tmp_path, capsys):
     assert "Seen: DICT_4X4_50 7." in fails(capsys, run, 2)
 
 
+def test_a_dictionary_that_the_photos_do_not_show(photo_plot, capsys):
+    message = fails(capsys, ["scale", photo_plot.cloud, "--dictionary", "6x6_50"])
+    assert "was not looked for" in message and "DICT_" in message
+
+
 # ---- known lengths and numbers
 
 

@@ -246,7 +246,7 @@ class EstimatorSettings(SettingsModel):
     )
     above_m: float = setting(0.70, "Stem used above", unit="m", ge=0.05, le=3.0)
     band_m: float = setting(
-        0.30, "Circle's band", unit="m", ge=0.02, le=2.0, help="height of the band the plain circle is fitted to"
+        0.60, "Circle's band", unit="m", ge=0.02, le=2.0, help="height of the band the plain circle is fitted to"
     )
     tolerance_m: float = setting(
         0.05, "Circle's tolerance", unit="m", ge=0.002, le=0.5, help="points farther away do not move the circle"
@@ -273,6 +273,9 @@ class EstimatorSettings(SettingsModel):
     )
     max_points: int = setting(2500, "Most points used", ge=200, le=1_000_000)
     min_points: int = setting(25, "Fewest points", ge=15, le=100_000)
+    min_arc_deg: float = setting(
+        100.0, "Smallest arc seen", unit="°", ge=0.0, le=360.0, help="with less of the ring seen no diameter is given"
+    )
     max_half_width: float = setting(
         0.40, "Widest interval", gt=0.01, le=2.0, help="half the 90 % interval, relative; wider is refused"
     )
@@ -292,7 +295,7 @@ class MarkerSettings(SettingsModel):
         1.0,
         "Marker side",
         unit="m",
-        gt=0.0,
+        ge=0.02,
         le=10.0,
         help="outer edge of the black square, for markers without their own",
     )

@@ -8,7 +8,7 @@ import pytest
 from tests.app.plots import make_cloud, make_document
 
 from dbh_studio.app import scaling
-from dbh_studio.app.commands import add_length
+from dbh_studio.app.commands import add_length, change_length
 from dbh_studio.app.lengths import metres_from_text
 from dbh_studio.app.scaling import (
     change_side,
@@ -19,6 +19,7 @@ from dbh_studio.app.scaling import (
     scale_from_camera_height,
     scale_from_evidence,
     strike_out,
+    use_marker,
 )
 from dbh_studio.core.bars import refused_scale
 from dbh_studio.core.camera import CameraModel
@@ -29,6 +30,7 @@ from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.scale_evidence import MarkedPoint, MarkerSquare, ScaleBar, ScaleEvidence, Sight
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.errors import CommandError
+from dbh_studio.settings import MarkerSettings
 
 PANORAMA = CameraModel("EQUIRECTANGULAR", 4096, 2048, ())
 PINHOLE = CameraModel("PINHOLE", 1000, 800, (900.0, 900.0, 500.0, 400.0))
@@ -189,7 +191,7 @@ def test_the_side_of_all_markers_changes_in_one_step():
 def placed(monkeypatch):
     """In place of `place_markers`: the square measures 2 units with all finds, 2.2 with one left out, none with two."""
 
-    def place(detections, posed, sides_m=None, struck=(), settings=None):
+    def place(detections, posed, sides_m=None, struck=(), settings=None, checks=()):
         left_out = {each for each in struck if each[0] in {d.image for d in detections}}
         squares = {0: (square(),), 1: (square(side_src=2.2),)}.get(len(left_out), ())
         return search_result(*(replace(each, side_m=(sides_m or {}).get(KEY, 1.0)) for each in squares))
@@ -227,6 +229,95 @@ def test_striking_out_leaves_a_scale_by_number_alone(placed):
     start = make_document(make_cloud(), evidence=ScaleEvidence((), (square(),)))
     after = strike_out(start, placed, PosedImages(()), ("a.jpg", *KEY)).apply(start)
     assert after.scale == start.scale and after.evidence != start.evidence
+
+
+# ---- finds of a program
+
+
+def finds_of(key, side_src, x_src, posed, images=None):
+    """What is detected of a flat marker with this side, `x_src` from the middle."""
+    from dbh_studio.stages.marker_detect import Detection
+
+    flat = side_src / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0.0]]) + (x_src, 0.0, 0.0)
+    crop = np.zeros((2, 2, 3), np.uint8)
+    return [
+        Detection(photo.name, *key, photo.project(flat)[0], 1.0, crop, 0.02, 2 * np.pi / 4096, 0.6)
+        for photo in posed
+        if images is None or photo.name in images
+    ]
+
+
+OTHER, THIRD = ("DICT_4X4_50", 13), ("DICT_4X4_50", 21)
+
+
+def test_the_side_of_a_marker_counts_by_whatever_name_of_its_dictionary():
+    posed = walk()
+    finds = finds_of(KEY, 1.0, 0.0, posed)
+    for name in ("DICT_4X4_50", "DICT_4X4_250", "4x4_1000"):
+        search = scaling.place_markers(finds, posed, {(name, KEY[1]): 0.5})
+        assert search.report.estimate.metres_per_unit == pytest.approx(0.5, rel=1e-3), name
+        assert search.squares[0].side_m == 0.5
+
+
+def test_turned_photos_are_told_from_a_marker_that_was_seen_once():
+    posed = walk()
+    finds = []
+    for number, find in enumerate(finds_of(KEY, 1.0, 0.0, posed)):
+        turned = find.corners_px + [PANORAMA.width_px * (number % 4) / 4, 0.0]
+        finds.append(replace(find, corners_px=turned % PANORAMA.width_px))
+    search = scaling.place_markers(finds, posed)
+    assert search.report.verdict.code == "poses_disagree"
+    assert scaling.place_markers(finds[:1], posed).report.verdict.code == "one_view"
+
+
+def test_a_marker_of_another_size_is_kept_as_a_check_that_fails_until_its_side_is_right():
+    posed = walk()
+    finds = [f for key, side, x in ((KEY, 1.0, -1.0), (THIRD, 1.0, 1.0), (OTHER, 0.5, 0.0))
+             for f in finds_of(key, side, x, posed)]  # fmt: skip
+    start = make_document(make_cloud(), scale=ScaleEstimate())
+    after = scaling.apply_search(start, scaling.place_markers(finds, posed)).apply(start)
+    assert after.scale.metres_per_unit == pytest.approx(1.0, rel=1e-3)
+    assert [(s.marker[1], s.role) for s in after.evidence.squares] == [(7, "control"), (13, "check"), (21, "control")]
+    verdict = after.evidence.report().verdict
+    assert verdict.code == "check_failed" and "DICT_4X4_50 13 measures 0.500 m instead of 1.000 m" in verdict.message
+    # Whatever places the markers anew, it stays a check, and its side is its own.
+    told = change_length("DICT_4X4_50 13", side_m=0.5).apply(after)
+    assert told.evidence.report().verdict.code == "agrees"
+    struck = strike_out(told, finds, posed, ("0.jpg", *KEY)).apply(told)
+    assert [(s.side_m, s.role) for s in struck.evidence.squares] == [(1.0, "control"), (0.5, "check"), (1.0, "control")]
+    assert struck.scale.metres_per_unit == pytest.approx(1.0, rel=1e-3)
+
+
+def test_two_sizes_and_no_side_named_give_no_scale_until_a_person_names_one():
+    posed = walk()
+    finds = finds_of(KEY, 1.0, -1.0, posed) + finds_of(OTHER, 0.5, 1.0, posed)
+    start = make_document(make_cloud(), scale=ScaleEstimate())
+    search = scaling.place_markers(finds, posed)
+    assert search.report.verdict.code == "contradict" and search.squares == ()
+    with pytest.raises(CommandError, match="contradict"):
+        scaling.apply_search(start, search)
+    after = use_marker(start, finds, posed, OTHER, 0.5).apply(start)
+    assert after.scale.metres_per_unit == pytest.approx(1.0, rel=1e-3)
+    assert after.evidence.report().verdict.code == "agrees"
+
+
+def test_a_find_is_struck_out_with_the_side_of_the_search():
+    posed = walk()
+    finds = finds_of(KEY, 1.0, -1.0, posed) + finds_of(OTHER, 1.3, 1.0, posed, images=("0.jpg", "2.jpg"))
+    start = make_document(make_cloud(), scale=ScaleEstimate())
+    after = strike_out(start, finds, posed, ("0.jpg", *OTHER), settings=MarkerSettings(side_m=0.5)).apply(start)
+    assert after.scale.metres_per_unit == pytest.approx(0.5, rel=1e-3)
+
+
+def test_a_cloud_in_metres_keeps_its_unit_where_that_is_wanted():
+    in_metres = make_document(make_cloud(), scale=ScaleEstimate(1.0, "metres"))
+    search = search_result(square())
+    kept = scaling.apply_search(in_metres, search, keep_number=True).apply(in_metres)
+    assert kept.scale == in_metres.scale and len(kept.evidence) == 1
+    asked = scaling.apply_search(in_metres, search).apply(in_metres)
+    assert asked.scale.metres_per_unit == pytest.approx(0.5)
+    weak = make_document(make_cloud(), scale=ScaleEstimate(0.7, "baseline", 0.1))
+    assert scaling.apply_search(weak, search, keep_number=True).apply(weak).scale.source == "marker"
 
 
 # ---- where nothing else exists

@@ -46,6 +46,13 @@ def test_the_standard_error_covers_the_error_and_never_falls_below_the_floor():
     assert estimate.standard_error / estimate.metres_per_unit >= 0.0005
 
 
+def test_what_no_number_of_bars_averages_out_is_that_of_the_caller():
+    bars = [bar([1, 0, 0], 2.0, length_se_m=1e-9), bar([0, 1, 0], 2.0, length_se_m=1e-9)]
+    for share in (0.002, 0.02):
+        report = scale_from_bars(bars, systematic_share=share)
+        assert [r.sigma_pct for r in report.residuals] == pytest.approx([100 * share] * 2, rel=1e-6)
+
+
 def test_check_bars_do_not_set_the_scale():
     controls = [bar([1, 0, 0], 2.0), bar([0, 1, 0], 2.0)]
     alone = scale_from_bars(controls)

@@ -61,6 +61,23 @@ def test_a_marker_alone_is_called_a_marker_and_says_in_how_many_photos():
     assert ScaleEvidence((bar(),), (square(role="check"),)).report().estimate.source == "bars"
 
 
+def test_markers_in_few_photos_are_doubted_however_well_they_agree():
+    found = {"marker": ("DICT_4X4_50", 7), "side_sigma_src": 1e-4}
+    for others in ((), (square("Marker 2", n_views=3),)):
+        report = ScaleEvidence((), (square(n_views=3, **found), *others)).report()
+        assert (report.verdict.level, report.verdict.code) == ("caution", "few_views")
+        assert "3 photos" in report.verdict.message and report.verdict.remedy
+    for better in (square("Marker 2", n_views=4), square("by hand", role="check")):
+        assert ScaleEvidence((), (square(n_views=3, **found), better)).report().verdict.code == "agrees"
+    off = ScaleEvidence((), (square(n_views=3, **found), square("Marker 2", side_m=1.1, role="check")))
+    assert off.report().verdict.code == "check_failed"
+
+
+def test_one_number_at_two_places_is_doubted():
+    twins = [square(name, marker=("DICT_4X4_50", 7), n_views=9) for name in ("DICT_4X4_50 7", "DICT_4X4_50 7 (2)")]
+    assert ScaleEvidence((), tuple(twins)).report().verdict.code == "twice"
+
+
 def test_a_check_does_not_move_the_scale_and_its_residual_is_said():
     controls = ScaleEvidence((bar(),))
     both = controls.with_length(bar("Check", length_src=2.02, role="check"))

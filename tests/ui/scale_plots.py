@@ -24,7 +24,7 @@ from dbh_studio.core.synthetic.marker_scene import MarkerBoard, MarkerScene, Pic
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.io.ply import write_ply
 from dbh_studio.settings import MarkerSettings
-from dbh_studio.stages.markers import find_markers
+from dbh_studio.stages.markers import Detection, find_markers
 
 FLAT, UPRIGHT = ("DICT_4X4_50", 7), ("DICT_4X4_50", 13)
 SIDES_M = {FLAT: 1.0, UPRIGHT: 0.5}
@@ -126,6 +126,18 @@ def search(side_m: float) -> MarkerSearch:
     settings = MarkerSettings(dictionaries=(FLAT[0],), side_m=side_m)
     finds = find_markers(plot().posed, settings=settings, read_image=lambda photo: pictures[photo.name])
     return place_markers(finds, plot().posed, settings=settings)
+
+
+@functools.cache
+def two_sizes() -> MarkerSearch:
+    """What a search finds where both markers are seen in all photos and both are taken for a metre."""
+    crop = np.full((8, 8, 3), 128, np.uint8)
+    finds = [
+        Detection(photo.name, *key, photo.project(plot().corners(key))[0], 1.0, crop, 0.05, 2 * np.pi / WIDTH, 0.6)
+        for photo in plot().posed
+        for key in SIDES_M
+    ]
+    return place_markers(finds, plot().posed)
 
 
 def write_plot(folder: Path, *, photos: bool = True) -> Path:

@@ -133,6 +133,50 @@ def test_the_enlarged_point_is_moved_by_a_click_and_by_the_arrow_keys(
     page.wait_for_selector("#dbh-banner", state="detached")
 
 
+def test_a_side_that_is_refused_does_not_stay_in_its_field(session: Session, shared_page: Any) -> None:
+    page = shared_page
+    page.click("button[data-way=markers]")
+    field = page.locator("input[data-field=marker-side]")
+    for typed, shown in (("abc", "1.00"), ("0", "1.00"), ("0,5", "0.50"), ("50 cm", "0.50")):
+        field.fill(typed)
+        page.keyboard.press("Enter")
+        until(lambda shown=shown: field.input_value() == shown)
+    browser.close_notifications(page)
+
+
+def test_the_chosen_point_is_dragged_by_its_arrows(studio: Studio, session: Session, shared_page: Any) -> None:
+    page, corner = shared_page, scale_plots.plot().corners()[0]
+    page.click("button[data-way=cloud]")
+    page.click("button[data-start=bar]")
+    look_at(studio, corner, np.array([0.2, -1.5, 2.5]))
+    page.mouse.click(*browser.pixel_of(page, corner))
+    page.wait_for_selector("button[data-point='0'][data-kind=done]")
+    marking, camera = tab_of(studio).marking, tab_of(studio).client.camera
+    before, eye = np.array(marking.picks.picks[0].point.xyz_src), np.asarray(camera.position)
+    time.sleep(1.0)  # the page draws the arrows
+    reach = 0.08 * float(np.linalg.norm(eye - before))
+    start = browser.pixel_of(page, before + [0.7 * reach, 0.0, 0.0])
+    end = browser.pixel_of(page, before + [1.7 * reach, 0.0, 0.0])
+    page.mouse.move(*start)
+    time.sleep(0.5)
+    page.mouse.down()
+    for share in np.linspace(0.1, 1.0, 10):
+        page.mouse.move(*(np.array(start) + share * (np.array(end) - start)))
+        time.sleep(0.05)
+    page.mouse.up()
+    until(lambda: not np.array_equal(marking.picks.picks[0].point.xyz_src, before))
+    step = np.array(marking.picks.picks[0].point.xyz_src) - before
+    np.testing.assert_allclose(step, [reach, 0.0, 0.0], atol=0.15 * reach)
+    np.testing.assert_allclose(camera.position, eye, atol=1e-6)  # the picture did not turn
+    # Undo takes the point back, and not what was done before.
+    label = session.undo_label
+    page.click("button[data-do=undo]")
+    page.wait_for_selector("button[data-point='0'][data-kind=open]")
+    assert session.undo_label == label
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#dbh-banner", state="detached")
+
+
 def test_a_bar_clicked_in_two_panoramas(studio: Studio, session: Session, shared_page: Any) -> None:
     page, truth, tab = shared_page, scale_plots.plot(), tab_of(studio)
     ends = truth.corners()[[0, 1]]

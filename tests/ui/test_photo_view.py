@@ -195,6 +195,7 @@ def test_a_reopened_plot_reads_its_photos_again_and_says_when_they_are_gone(stud
         go_to_scale(client)
         client.wait_text("The photos of this plot cannot be shown", LONG)
         client.wait_text("There is no such file or folder")
+        client.wait_text("If they were moved, type where they are now")
         assert "/cameras" not in client.scene
 
 

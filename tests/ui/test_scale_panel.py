@@ -1,17 +1,20 @@
 """The Scale step over the real websocket: by number, by clicks in the cloud and in photos, by markers, and undone."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scale_plots
 from fakeclient import FakeClient
 from panel import LONG
+from scipy.spatial import cKDTree
 
 from dbh_studio.app import commands
 from dbh_studio.app.scaling import apply_search
 from dbh_studio.core.scale import ScaleEstimate
-from dbh_studio.core.scale_evidence import MarkedPoint, ScaleBar
+from dbh_studio.core.scale_evidence import MarkedPoint, ScaleBar, ScaleEvidence
+from dbh_studio.ui import scale_html
 
 CORNERS = 4
 
@@ -150,6 +153,37 @@ def test_the_close_up_moves_a_point_by_a_click_by_keys_and_by_arrows(tab, studio
     tab.wait(lambda _: np.allclose(marking.picks.picks[0].point.xyz_src, [1, 2, 0], atol=1e-9))
     tab.bridge_send("mark", ["remove", 0])
     tab.wait_text("(1 of 2)")
+
+
+def test_a_click_between_the_points_of_a_sparse_part_marks_its_surface(tab, studio):
+    """Around the marker the ground has a fortieth of the points of the marker."""
+    points = scale_plots.plot().cloud.xyz
+    ground = points[(np.abs(points[:, 2]) < 0.02) & (np.linalg.norm(points[:, :2], axis=1) > 6.0)]
+    tree = cKDTree(ground)
+    places = np.random.default_rng(0).uniform(-9, 9, (4000, 3)) * [1, 1, 0]
+    places = places[np.linalg.norm(places[:, :2], axis=1) > 7.0]
+    gap = tree.query(places)[0]
+    place = places[np.argmax(np.where(gap < np.quantile(gap, 0.99), gap, 0))]  # the middle of a gap
+    tab.bridge_send("mark", ["start", ["bar", "cloud"]])
+    tab.wait_text("(1 of 2)")
+    tab.look(place + [0.3, -1.0, 1.5], place)
+    assert tab_of(studio).studio.display.picking.spacing * 3 < gap.max()
+    tab.click_scene(place)
+    tab.wait(lambda t: n_marked(t) == 1)
+    found = np.array(tab_of(studio).marking.picks.picks[0].point.xyz_src)
+    np.testing.assert_allclose(found, place, atol=0.05)
+
+
+def test_what_was_typed_outlives_the_points_that_are_moved_after_it(tab, studio, session):
+    tab.bridge_send("mark", ["start", ["bar", "cloud"]])
+    tab.look((0, 0, 8), (0.01, 0, 0))
+    for x in (0.5, 2.0):
+        before = n_marked(tab)
+        tab.click_scene((x, 0.5, 0.0))
+        tab.wait(lambda t, n=before: n_marked(t) == n + 1)
+    tab.bridge_send("mark", ["typed", '0.9"'])
+    tab.bridge_send("mark", ["nudge", [3, 0]])
+    tab.wait(lambda t: 'value="0.9&quot;"' in t.html())
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "one", "", "1e400", "nan", "<b>1</b>", "99999999"])
@@ -348,6 +382,64 @@ def test_a_marker_that_few_photos_show_is_left_out_until_a_person_says_so(tab, s
     assert session.document.scale.metres_per_unit == pytest.approx(scale_plots.plot().metres_per_unit, rel=0.003)
 
 
+def test_markers_of_two_sizes_are_both_shown_with_a_field_and_one_side_lets_the_person_go_on(tab, studio, session):
+    found = scale_plots.two_sizes()
+    names = [f"{dictionary} {number}" for dictionary, number in (scale_plots.FLAT, scale_plots.UPRIGHT)]
+    tab_of(studio).worker.post(studio.markers._searched, session, session.document, found)
+    tab.wait_notification("contradict each other")
+    tab.wait_text("contradict each other")
+    for name in names:
+        row = re.search(rf"<b>{name}</b> not used.*?</div>(.*?</figure>)", tab.html(), re.DOTALL)
+        assert row and "<img" in row[1], name
+        assert f'aria-label="Side of {name}"' in tab.html()
+    assert not session.document.scale.is_known and not len(session.document.evidence)
+    tab.bridge_send("use-marker", [*scale_plots.UPRIGHT, "50 cm"])
+    tab.wait(lambda _: session.document.scale.is_known)
+    tab.wait(lambda t: "contradict each other" not in t.text())
+    truth = scale_plots.plot().metres_per_unit
+    assert session.document.scale.metres_per_unit == pytest.approx(truth, rel=0.01)
+    # The first one has the side of all, which is right; where it were not, it would be in the list to be corrected.
+    assert {each.name for each in session.document.evidence} == set(names)
+
+
+def test_the_field_of_the_side_follows_what_the_markers_have(tab, session):
+    session.do(apply_search(session.document, scale_plots.search(1.0)))
+    tab.wait_text("Known lengths")
+    tab.bridge_send("marker-side", "50 cm")
+    tab.wait(lambda _: {square.side_m for square in session.document.evidence.squares} == {0.5})
+    tab.bridge_send("undo")
+    field = re.compile(r'value="([0-9.]+)"[^>]*data-field="marker-side"')
+    tab.wait(lambda t: field.findall(t.html()) == ["1.00"])
+    tab.bridge_send("marker-side", "0.8")
+    tab.wait(lambda _: {square.side_m for square in session.document.evidence.squares} == {0.8})
+
+
+def test_a_search_leaves_the_unit_of_the_file_alone_and_says_what_the_markers_say(tab, studio, session):
+    session.do(commands.set_scale(ScaleEstimate(2.0, "factor")))
+    tab_of(studio).worker.post(studio.markers._searched, session, session.document, scale_plots.search(1.0))
+    tab.bridge_send("scale-way", "markers")
+    tab.wait_text("That is not applied")
+    assert session.document.scale == ScaleEstimate(2.0, "factor") and session.undo_label == "Find markers"
+    tab.press("Set the scale from the known lengths")
+    tab.wait(lambda _: session.document.scale.source == "marker")
+
+
+def test_photos_that_do_not_belong_to_the_cloud_give_no_scale(tab, studio, session):
+    fit = replace(session.cameras.fit, status="moved", message="They lie elsewhere.", remedy="Export both alike.")
+    session.remember_cameras(replace(session.cameras, fit=fit))
+    tab_of(studio).worker.post(tab_of(studio).photos_changed)
+    tab.wait_text("They lie elsewhere.")
+    ways = (
+        lambda: tab.press("Find markers in the photos"),
+        lambda: tab.bridge_send("mark", ["start", ["bar", "photos"]]),
+    )
+    for number, use in enumerate(ways, start=1):
+        use()
+        tab.wait(lambda t, n=number: sum("They lie elsewhere." in note.title for note in t.notifications) == n)
+    assert not tab_of(studio).marking.is_on and studio._job is None
+    assert not session.document.scale.is_known
+
+
 def test_a_search_can_be_cancelled(tab, session, studio):
     before = session.document
     tab.press("Find markers in the photos")
@@ -392,6 +484,15 @@ def test_a_wrong_length_in_the_list_is_answered_in_words(listed, session):
         listed.bridge_send("length-true", ["Pole", text])
         listed.wait_notification(why)
     assert session.document is before
+
+
+def test_what_stands_against_the_lengths_is_said_before_they_are_applied():
+    odd = bar("Tape", 4.0, 3.0)
+    report = ScaleEvidence((bar(), odd)).report()
+    for scale in (ScaleEstimate(), ScaleEstimate(0.7, "factor")):
+        assert "contradict each other" in scale_html.state(scale, report, "")
+        alone = scale_html.state(scale, ScaleEvidence((bar(),)).report(), "")
+        assert "contradict" not in alone and "nothing checks" not in alone
 
 
 def test_without_a_control_the_button_is_gone_and_why_is_said(listed):

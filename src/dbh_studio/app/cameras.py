@@ -11,7 +11,7 @@ from dbh_studio.app.document import CameraSource
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.errors import FileError
+from dbh_studio.errors import CommandError, FileError
 
 if TYPE_CHECKING:
     from dbh_studio.app.session import Session
@@ -77,6 +77,12 @@ def read_cameras(
     placed = posed.in_cloud_frame() if frame == "file" else posed
     missing = tuple(photo.name for photo in posed if photo.path is None)
     return Cameras(replace(source, frame=frame), placed, fit, missing)
+
+
+def require_fit(cameras: Cameras) -> None:
+    """Raise CommandError where photos do not belong to the cloud: they would measure in another unit."""
+    if cameras.fit.status == "moved":
+        raise CommandError(cameras.fit.message, cameras.fit.remedy)
 
 
 def cameras_of(session: Session, progress: Progress = ignore_progress) -> Cameras | None:

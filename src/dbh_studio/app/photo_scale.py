@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dbh_studio.app.cameras import Cameras, cameras_of, cloud_sample, read_cameras
+from dbh_studio.app.cameras import Cameras, cameras_of, cloud_sample, read_cameras, require_fit
 from dbh_studio.app.commands import set_cameras
 from dbh_studio.app.document import CameraSource
 from dbh_studio.app.jobs import run_job
-from dbh_studio.app.scaling import MarkerSearch, apply_search, place_markers, search_markers
+from dbh_studio.app.scaling import MarkerSearch, apply_search, checks_of, place_markers, search_markers
 from dbh_studio.app.session import Session
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale_evidence import MarkerKey
@@ -57,13 +57,13 @@ def add_photos(
     if request.cameras is None and request.images_dir is None and session.document.cameras is not None:
         known = cameras_of(session, progress)
         assert known is not None
+        require_fit(known)
         return known
     source = CameraSource.of(_place(session, request), request.images_dir)
     cameras: Cameras = run_job(
         read_cameras, source, cloud_sample(session.cloud), in_process=in_process, progress=progress
     )
-    if cameras.fit.status == "moved":
-        raise CommandError(cameras.fit.message, cameras.fit.remedy)
+    require_fit(cameras)
     session.remember_cameras(cameras)
     session.do(set_cameras(cameras.source))
     return cameras
@@ -100,14 +100,17 @@ def scale_by_photos(
         cameras.posed,
         struck=session.document.evidence.struck,
         settings=request.settings,
+        checks=tuple(checks_of(session.document)),
         in_process=in_process,
         progress=subprogress(progress, 0.05, 1.0),
     )
     sides = _sides(search.detections, request.sides)
     if sides:
-        struck = session.document.evidence.struck
+        evidence = session.document.evidence
         believed = [each for each in search.detections if not request.only_named or each.key in sides]
-        search = place_markers(believed, cameras.posed, sides, struck, request.settings)
+        search = place_markers(
+            believed, cameras.posed, sides, evidence.struck, request.settings, checks_of(session.document)
+        )
     verdict = search.report.verdict
     if verdict.code in STOPPING_VERDICTS:
         raise CommandError(verdict.message, verdict.remedy)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,9 +13,9 @@ from dbh_studio.app.commands import Command, set_evidence, set_frame, set_scale
 from dbh_studio.app.document import Document
 from dbh_studio.app.lengths import check_length
 from dbh_studio.core.arrays import Float64
-from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.core.scale import ScaleEstimate
-from dbh_studio.core.scale_evidence import MarkedPoint, MarkerKey, MarkerSquare, Sight
+from dbh_studio.core.progress import Progress, ignore_progress, subprogress
+from dbh_studio.core.scale import WEAK_SOURCES, ScaleEstimate
+from dbh_studio.core.scale_evidence import WELL_SEEN, MarkedPoint, MarkerKey, MarkerSquare, Sight
 from dbh_studio.errors import CommandError
 from dbh_studio.settings import MarkerSettings
 
@@ -32,6 +33,10 @@ CLICK_SIGMA_PX = 1.0
 _HELD_SHARE = 0.05
 _PATH_SHARE = 0.02
 _MIN_CAMERAS = 3
+# A marker that is off by more than this share, and by so many standard errors, is not of the size given.
+_OTHER_SIZE, _OTHER_SIZE_SIGMAS = 0.01, 4.0
+# A scale from elsewhere is not replaced unasked.
+_MEASURED = frozenset({"unknown", "marker", "bars"})
 # Rays that meet at less say little about the distance.
 _GOOD_PARALLAX_DEG = 8.0
 
@@ -42,7 +47,7 @@ class MarkerSearch:
 
     Attributes:
         detections: All sights, each with its picture.
-        squares: The markers in space that can be used, with the side they were given.
+        squares: The markers in space, with the side they were given; those that are not of this size as check.
         report: What the markers alone say of the scale.
         problems: Per marker left out: its name and why.
     """
@@ -61,6 +66,7 @@ def search_markers(
     sides_m: Mapping[MarkerKey, float] | None = None,
     struck: Sequence[tuple[str, str, int]] = (),
     settings: MarkerSettings = MarkerSettings(),  # noqa: B008 - frozen
+    checks: Collection[MarkerKey] = (),
     *,
     progress: Progress = ignore_progress,
 ) -> MarkerSearch:
@@ -71,6 +77,7 @@ def search_markers(
         sides_m: Side of the black square per (dictionary, id); the others have `settings.side_m`.
         struck: (photo, dictionary, id) of detections to leave out.
         settings: Dictionaries, ids, side.
+        checks: (dictionary, id) of markers that only test the scale.
         progress: Called once per photo.
 
     Raises:
@@ -78,11 +85,16 @@ def search_markers(
         MissingComponentError: OpenCV is absent.
         SettingError: There is no dictionary of that name.
     """
+    from dbh_studio.core.bars import refused_scale
     from dbh_studio.io.photos import read_photo
-    from dbh_studio.stages.markers import find_markers
+    from dbh_studio.stages.markers import find_markers, why_none
 
-    detections = find_markers(posed, settings=settings, read_image=read_photo, progress=progress)
-    return place_markers(detections, posed, sides_m, struck, settings)
+    searching, looking = subprogress(progress, 0.0, 0.95), subprogress(progress, 0.95, 1.0)
+    detections = find_markers(posed, settings=settings, read_image=read_photo, progress=searching)
+    why = None if detections else why_none(posed, settings, read_photo, looking)
+    if why is not None:
+        return MarkerSearch((), (), refused_scale(why.code, why.reason, why.remedy), ())
+    return place_markers(detections, posed, sides_m, struck, settings, checks)
 
 
 def place_markers(
@@ -91,27 +103,61 @@ def place_markers(
     sides_m: Mapping[MarkerKey, float] | None = None,
     struck: Sequence[tuple[str, str, int]] = (),
     settings: MarkerSettings = MarkerSettings(),  # noqa: B008 - frozen
+    checks: Collection[MarkerKey] = (),
 ) -> MarkerSearch:
-    """The markers in space from detections, without those that were struck out. Takes well under a second."""
+    """The markers in space from detections, without those that were struck out. Takes well under a second.
+
+    A marker that measures something else than it is said to be is kept as a check: it shows, and can be corrected.
+    """
     from dbh_studio.stages.markers import check_marker, scale_from_markers, triangulate_markers
 
+    sides = {_as_found(key): float(side_m) for key, side_m in (sides_m or {}).items()}
     left_out = set(struck)
     believed = [d for d in detections if (d.image, d.dictionary, d.marker_id) not in left_out]
     markers = triangulate_markers(believed, posed, settings=settings)
-    seen_once = sorted({detection.key for detection in believed} - {marker.key for marker in markers})
-    report = scale_from_markers(markers, sides_m, settings=settings, seen_once=seen_once)
+    sights = Counter(detection.key for detection in believed)
+    report = scale_from_markers(
+        markers,
+        sides,
+        settings=settings,
+        seen_once=sorted(set(sights) - {marker.key for marker in markers}),
+        sights=sights,
+        left_out=checks,
+    )
     used = {residual.name for residual in report.residuals}
     problems = [(marker.name, check_marker(marker)) for marker in markers]
     squares: list[MarkerSquare] = []
     for marker, (_, problem) in zip(markers, problems, strict=True):
-        if marker.name in used and problem is None:
+        if problem is None:
             # A number that stands at two places gives two squares of one name.
             twins = sum(square.marker == marker.key for square in squares)
-            side_m = float((sides_m or {}).get(marker.key, settings.side_m))
-            squares.append(_square(marker, believed, side_m, settings, twins))
+            side_m = sides.get(marker.key, settings.side_m)
+            square = _square(marker, believed, side_m, settings, twins)
+            if marker.key not in checks and marker.name in used:
+                squares.append(square)
+            elif marker.key in checks or _is_other_size(square, report.estimate, is_named=marker.key in sides):
+                squares.append(replace(square, role="check"))
     return MarkerSearch(
         tuple(detections), tuple(squares), report, tuple((name, why) for name, why in problems if why is not None)
     )
+
+
+def _as_found(key: MarkerKey) -> MarkerKey:
+    """As finds call it: ``DICT_4X4_250`` and ``DICT_4X4_50`` share their first markers."""
+    from dbh_studio.io.marker_codes import known_name, smallest_dictionary
+
+    dictionary, number = key
+    return smallest_dictionary(known_name(dictionary), number), number
+
+
+def _is_other_size(square: MarkerSquare, scale: ScaleEstimate | None, *, is_named: bool) -> bool:
+    """Whether a marker that was not used contradicts the scale of the others."""
+    may_be_none = not is_named and square.n_views is not None and square.n_views < WELL_SEEN
+    if scale is None or may_be_none:
+        return False
+    off = float(np.log(square.measured_src * scale.metres_per_unit / square.side_m))
+    sigma = float(np.hypot(square.sigma_src, square.systematic_src)) / square.measured_src
+    return abs(off) > max(_OTHER_SIZE, _OTHER_SIZE_SIGMAS * sigma)
 
 
 def _square(
@@ -141,8 +187,13 @@ def _square(
     )
 
 
-def apply_search(document: Document, search: MarkerSearch) -> Command:
+def apply_search(document: Document, search: MarkerSearch, *, keep_number: bool = False) -> Command:
     """One step: keep the markers found, and take the scale from them and the lengths marked by hand.
+
+    Args:
+        document: The plot.
+        search: What was found.
+        keep_number: Leave a scale alone that is the unit of the file or a factor; the markers then only say otherwise.
 
     Raises:
         CommandError: They give no scale; says why. The evidence is then not touched either.
@@ -151,6 +202,8 @@ def apply_search(document: Document, search: MarkerSearch) -> Command:
     report = evidence.report(np.array(document.up_direction)) if search.squares else search.report
     if report.estimate is None:
         raise CommandError(report.verdict.message, report.verdict.remedy)
+    if keep_number and document.scale.source not in _MEASURED | WEAK_SOURCES:
+        return set_evidence(evidence, label="Find markers")
     return set_evidence(evidence, label="Set the scale by markers", scale=report.estimate)
 
 
@@ -161,6 +214,7 @@ def strike_out(
     sight: tuple[str, str, int],
     *,
     struck: bool = True,
+    settings: MarkerSettings = MarkerSettings(),  # noqa: B008 - frozen
 ) -> Command:
     """One step: leave one detection out (or take it in again), place the markers anew, and take the scale from them.
 
@@ -172,26 +226,33 @@ def strike_out(
         posed: The photos, in the cloud's frame.
         sight: (photo, dictionary, id).
         struck: Whether it is no marker.
+        settings: Of the search; above all the side of markers that were not placed before.
     """
     others = tuple(each for each in document.evidence.struck if each != sight)
     left_out = (*others, sight) if struck else others
     what = f"{sight[1]} {sight[2]} in {sight[0]}"
     label = f"Strike out {what}" if struck else f"Use {what} again"
-    search = place_markers(detections, posed, sides_of(document), left_out)
+    search = place_markers(detections, posed, sides_of(document), left_out, settings, checks_of(document))
     return _placed_anew(document, search, left_out, label)
 
 
 def use_marker(
-    document: Document, detections: Sequence[Detection], posed: PosedImages, marker: MarkerKey, side_m: float
+    document: Document,
+    detections: Sequence[Detection],
+    posed: PosedImages,
+    marker: MarkerKey,
+    side_m: float,
+    settings: MarkerSettings = MarkerSettings(),  # noqa: B008 - frozen
 ) -> Command:
-    """One step: believe a marker that few photos show, place the markers anew, and take the scale from them.
+    """One step: believe a marker that was left out, place the markers anew, and take the scale from them.
 
     Raises:
         CommandError: Also the person's word does not make a marker of it; says why.
     """
     name = f"{marker[0]} {marker[1]}"
     struck = document.evidence.struck
-    search = place_markers(detections, posed, sides_of(document) | {marker: side_m}, struck)
+    sides = sides_of(document) | {marker: side_m}
+    search = place_markers(detections, posed, sides, struck, settings, checks_of(document))
     if not any(square.marker == marker for square in search.squares):
         why = next((refusal for other, refusal in search.problems if other == name), None)
         if why is not None:
@@ -209,13 +270,20 @@ def _placed_anew(
 ) -> Command:
     evidence = replace(document.evidence, struck=struck).with_found(search.squares)
     report = evidence.report(np.array(document.up_direction))
-    is_measured = document.scale.source in ("unknown", "marker", "bars")
+    is_measured = document.scale.source in _MEASURED
     return set_evidence(evidence, label=label, scale=report.estimate if is_measured else None)
 
 
 def sides_of(document: Document) -> dict[MarkerKey, float]:
     """The side of each marker found so far."""
     return {square.marker: square.side_m for square in document.evidence.squares if square.marker is not None}
+
+
+def checks_of(document: Document) -> frozenset[MarkerKey]:
+    """The markers found so far that only test the scale."""
+    found = [square for square in document.evidence.squares if square.marker is not None]
+    controls = {square.marker for square in found if square.role == "control"}
+    return frozenset(square.marker for square in found if square.marker is not None and square.marker not in controls)
 
 
 def change_side(document: Document, before_m: float, side_m: float) -> Command:

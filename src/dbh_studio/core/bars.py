@@ -209,7 +209,7 @@ def scale_from_bars(
     )
     estimate = ScaleEstimate(combined.metres_per_unit, source, combined.standard_error)
     relative_se = combined.standard_error / combined.metres_per_unit
-    residuals = tuple(_residual(bar, combined.metres_per_unit, relative_se, up_src) for bar in bars)
+    residuals = tuple(_residual(bar, combined.metres_per_unit, relative_se, systematic_share, up_src) for bar in bars)
     ratio, ratio_se = _ratio(residuals)
     verdict = _verdict(residuals, combined.chi2, combined.freedom, relative_se, ratio, ratio_se)
     return ScaleReport(estimate, residuals, combined.chi2, combined.freedom, ratio, ratio_se, None, verdict)
@@ -231,12 +231,14 @@ def _unusable(bars: Sequence[KnownLength]) -> ScaleReport | None:
     return None
 
 
-def _residual(bar: KnownLength, metres_per_unit: float, relative_se: float, up_src: Float64 | None) -> BarResidual:
+def _residual(
+    bar: KnownLength, metres_per_unit: float, relative_se: float, systematic_share: float, up_src: Float64 | None
+) -> BarResidual:
     measured_m = metres_per_unit * bar.measured_src
     own = float(np.hypot(bar.sigma_src / bar.measured_src, bar.length_se_m / bar.length_m))
-    # A check bar is not in the mean: the error of the mean comes on top of its own.
     own = float(np.hypot(own, bar.systematic_src / bar.measured_src))
-    sigma = float(np.hypot(own, relative_se)) if bar.role == "check" else float(np.hypot(own, SYSTEMATIC_SHARE))
+    # A check bar is not in the mean: the error of the mean comes on top of its own.
+    sigma = float(np.hypot(own, relative_se if bar.role == "check" else systematic_share))
     residual_m = measured_m - bar.length_m
     return BarResidual(
         bar.name,
@@ -294,7 +296,7 @@ def _verdict(
         return ScaleVerdict(
             "caution",
             "check_failed",
-            f"Check bar {worst.name or 'without a name'} measures {worst.measured_m:.3f} m instead of "
+            f"The check length {worst.name or 'without a name'} measures {worst.measured_m:.3f} m instead of "
             f"{worst.length_m:.3f} m ({worst.residual_pct:+.2f} %).",
             "Check its length and ends; if they are right, the reconstruction is bent or the controls are wrong.",
         )

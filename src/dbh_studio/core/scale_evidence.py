@@ -6,7 +6,7 @@ once can be corrected, struck or tested against long after the trees were measur
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,6 +21,8 @@ MarkerKey = tuple[str, int]
 
 # Sides and diagonals of a flat square agree better than this share of the side.
 MAX_UNEVENNESS = 0.02
+# In fewer photos a marker is not seen from enough sides for its error to be believed.
+WELL_SEEN = 4
 _SIDES = ((0, 1), (1, 2), (2, 3), (3, 0))
 _DIAGONALS = ((0, 2), (1, 3))
 
@@ -295,11 +297,45 @@ class ScaleEvidence:
         controls = [square for square in self.squares if square.role == "control"]
         views = [square.n_views for square in controls if square.n_views is not None]
         report = replace(report, n_views=min(views) if views else None)
-        bent = [square for square in controls if square.is_uneven]
-        if report.estimate is None or not bent:
-            return report
-        worst = max(bent, key=lambda square: square.unevenness)
-        return replace(report, verdict=_bent(worst))
+        doubt = _doubt(list(self), report)
+        return report if doubt is None else replace(report, verdict=doubt)
+
+
+def _doubt(lengths: Sequence[ScaleBar | MarkerSquare], report: ScaleReport) -> ScaleVerdict | None:
+    """What the lengths alone do not tell: how the markers that set the scale were seen. None where that is in order."""
+    if report.estimate is None:
+        return None
+    controls = [each for each in lengths if isinstance(each, MarkerSquare) and each.role == "control"]
+    bent = [square for square in controls if square.is_uneven]
+    if bent:
+        return _bent(max(bent, key=lambda square: square.unevenness))
+    # What the lengths say against each other weighs more.
+    if report.verdict.level != "good" and report.verdict.code != "unchecked":
+        return None
+    said = (
+        f"The scale is known to ±{100 * (report.estimate.standard_error or 0) / report.estimate.metres_per_unit:.2f} %"
+    )
+    found = [square.marker for square in controls if square.marker is not None]
+    if len(set(found)) < len(found):
+        return ScaleVerdict(
+            "caution",
+            "twice",
+            f"{said}, but one marker number stands at two places.",
+            "Use each marker number once in a plot.",
+        )
+    # One length that is known better, and agrees, is a test of the others.
+    if report.n_views is not None and all(map(_is_little_seen, lengths)):
+        return ScaleVerdict(
+            "caution",
+            "few_views",
+            f"{said}, by markers seen in {report.n_views} photos only.",
+            "Take more photos of it, from all sides, or mark another known length to test it.",
+        )
+    return None
+
+
+def _is_little_seen(length: ScaleBar | MarkerSquare) -> bool:
+    return isinstance(length, MarkerSquare) and length.n_views is not None and length.n_views < WELL_SEEN
 
 
 def _bent(square: MarkerSquare) -> ScaleVerdict:

@@ -7,9 +7,20 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from dbh_studio.app.autosave import Autosave
+from dbh_studio.app.cameras import require_fit
+from dbh_studio.app.commands import Command
 from dbh_studio.app.document import CameraSource, Document
 from dbh_studio.app.marker_cache import keep_detections, kept_detections
-from dbh_studio.app.scaling import MarkerSearch, apply_search, search_markers, sides_of, strike_out, use_marker
+from dbh_studio.app.scaling import (
+    MarkerSearch,
+    apply_search,
+    checks_of,
+    place_markers,
+    search_markers,
+    sides_of,
+    strike_out,
+    use_marker,
+)
 from dbh_studio.errors import StudioError
 from dbh_studio.settings import MarkerSettings
 
@@ -54,14 +65,15 @@ class MarkerFinds:
             side_m: Of markers that were not found before.
 
         Raises:
-            StudioError: There are no photos, or another job runs.
+            StudioError: There are no photos, they do not belong to the cloud, or another job runs.
         """
         session = self._studio.session
         if session is None or session.cameras is None:
             raise StudioError("This plot has no photos yet.", "Add them first.")
         document, cameras = session.document, session.cameras
+        require_fit(cameras)
         settings = MarkerSettings().changed(side_m=side_m)
-        call = (cameras.posed, sides_of(document), document.evidence.struck, settings)
+        call = (cameras.posed, sides_of(document), document.evidence.struck, settings, checks_of(document))
         done = partial(self._searched, session, document)
         self._studio.start_job("Finding markers", search_markers, call, session, done)
 
@@ -71,33 +83,54 @@ class MarkerFinds:
             return
         with self._lock:
             self._session, self._cameras, self._detections = session, cameras, search.detections
-            verdict = search.report.verdict
-            said = [("", verdict.message, verdict.remedy)] if verdict.level != "good" else []
-            others = [
-                (name, why.reason, why.remedy) for name, why in search.problems if why.reason not in verdict.message
-            ]
-            self.problems = (*said, *others)
+            self.problems = _problems(search)
         folder = _folder(session)
         if folder is not None:
             keep_detections(folder, cameras, search.detections)
         # Also where no scale comes of it: the pictures show why.
         self._studio.refresh_tabs()
-        session.do(apply_search(session.document, search), based_on=document, reads=("cameras",))
+        command = apply_search(session.document, search, keep_number=True)
+        session.do(command, based_on=document, reads=("cameras",))
 
-    def strike(self, session: Session, sight: tuple[str, str, int], *, struck: bool) -> None:
-        """Leave one find out, or take it in again: one undoable step."""
+    def strike(self, session: Session, sight: tuple[str, str, int], side_m: float, *, struck: bool) -> None:
+        """Leave one find out, or take it in again: one undoable step. `side_m` is of markers not placed before."""
         detections, cameras = self.of(session), session.cameras
         if detections is None or cameras is None:
             return
         if not any((each.image, *each.key) == sight for each in detections):
             return
-        session.do(strike_out(session.document, detections, cameras.posed, sight, struck=struck))
+        settings = MarkerSettings().changed(side_m=side_m)
+        command = strike_out(session.document, detections, cameras.posed, sight, struck=struck, settings=settings)
+        self._do(session, command, settings)
 
-    def use(self, session: Session, marker: tuple[str, int], side_m: float) -> None:
-        """Believe a marker that was left out because few photos show it: one undoable step."""
+    def use(self, session: Session, marker: tuple[str, int], side_m: float, others_m: float) -> None:
+        """Believe a marker that was left out: one undoable step. `others_m` is the side of those not placed before."""
         detections, cameras = self.of(session), session.cameras
         if detections is not None and cameras is not None and any(each.key == marker for each in detections):
-            session.do(use_marker(session.document, detections, cameras.posed, marker, side_m))
+            settings = MarkerSettings().changed(side_m=others_m)
+            command = use_marker(session.document, detections, cameras.posed, marker, side_m, settings)
+            self._do(session, command, settings)
+
+    def _do(self, session: Session, command: Command, settings: MarkerSettings) -> None:
+        """Do it, and say anew what is wrong: what was said of the search may be mended by it."""
+        document = command.apply(session.document)
+        detections, cameras = self.of(session), session.cameras
+        if detections is not None and cameras is not None:
+            struck = document.evidence.struck
+            search = place_markers(detections, cameras.posed, sides_of(document), struck, settings, checks_of(document))
+            self.problems = _problems(search)
+        session.do(command)
+
+
+def _problems(search: MarkerSearch) -> tuple[Problem, ...]:
+    """What is not said by the known lengths themselves: why there is no scale, and why markers were left out."""
+    verdict = search.report.verdict
+    is_refused = verdict.level == "refused" and not search.squares
+    said = [("", verdict.message, verdict.remedy)] if is_refused or verdict.code == "default_side" else []
+    others = [
+        (name, why.reason, why.remedy) for name, why in search.problems if not said or why.reason not in verdict.message
+    ]
+    return (*said, *others)
 
 
 def _folder(session: Session) -> Path | None:

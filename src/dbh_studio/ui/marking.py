@@ -8,19 +8,23 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from dbh_studio.app import commands
+from dbh_studio.app.cameras import require_fit
 from dbh_studio.app.document import Document
 from dbh_studio.app.lengths import metres_from_text
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.close_up import CloseUp
+from dbh_studio.core.picking import PickCloud, PickHit
 from dbh_studio.core.scale_evidence import MarkedPoint, PointSrc, ScaleBar, Sight
 from dbh_studio.errors import StudioError
 from dbh_studio.ui import marking_html
 from dbh_studio.ui.bind import SceneClick, view_of
 from dbh_studio.ui.plot_frame import direction_in_world, source_of, world_of
 from dbh_studio.ui.point_picks import LengthKind, PickPlace, PointPicks
+from dbh_studio.ui.scale_html import metres
 from dbh_studio.ui.scale_scene import LengthMark, PointMark, ScaleScene
 
 if TYPE_CHECKING:
+    from dbh_studio.app.cameras import Cameras
     from dbh_studio.app.session import Session
     from dbh_studio.core.posed_images import PosedImages
     from dbh_studio.ui.tab import Tab
@@ -32,6 +36,11 @@ _CLOSEST_SPACINGS, _WIDEST_SPACINGS = 3.0, 400.0
 # How near to what they mean people click, pixels of the picture or of the close-up.
 _HIT_PX = 1.5
 _PHOTO_ZOOM = 4.0
+_MOST_TYPED = 40
+# In a sparse part a click falls between the points: how far from it they are looked for, spacings of the whole cloud,
+# and how far they may be, spacings of that part.
+_SPARSE_SPACINGS, _BETWEEN_SPACINGS = (6.0, 12.0, 24.0), 4.0
+_NOTHING_THERE = ("There is no point of the cloud there.", "Click on the cloud itself; zoom in if need be.")
 
 
 class Marking:
@@ -58,7 +67,7 @@ class Marking:
         """Begin a new length; what was begun before is dropped."""
         self._tab.require_session()
         if place == "photos":
-            self._posed()
+            require_fit(self._cameras())
         self._begin(PointPicks(kind, place))
 
     def edit(self, name: str) -> None:
@@ -89,18 +98,21 @@ class Marking:
             raise StudioError("Not all points are marked yet.", "Click the missing ones first.")
         what = "The side of the black square" if picks.kind == "square" else "The length of the bar"
         true_m = metres_from_text(text, what)
-        evidence = session.document.evidence
+        document = session.document
+        evidence = document.evidence
         before = next((length for length in evidence if length.name == picks.edited), None)
         length = picks.length(evidence.free_name("Bar" if picks.kind == "bar" else "Marker"), true_m, before)
-        session.do(commands.add_length(length))
+        # Another tab may have given the name to another length just now.
+        session.do(commands.add_length(length), based_on=document, reads=("evidence",))
         self.stop()
 
-    def typed_m(self) -> float:
-        """The length that is offered: that of the length marked anew, or a metre."""
-        session, picks = self._tab.session, self.picks
-        if session is None or picks is None or picks.edited not in session.document.evidence:
-            return 1.0
-        return session.document.evidence[picks.edited].length_m
+    @staticmethod
+    def _offered_text(session: Session, picks: PointPicks) -> str:
+        """What stands in the field of the true length: as typed, else that of the length marked anew, or a metre."""
+        if picks.typed is not None:
+            return picks.typed
+        evidence = session.document.evidence
+        return metres(evidence[picks.edited].length_m if picks.edited in evidence else 1.0)
 
     # ---- what a page may ask
 
@@ -133,6 +145,8 @@ class Marking:
             picks.remove(value)
             self.close_up = None
             self._changed()
+        elif action == "typed" and isinstance(value, str):
+            picks.typed = value[:_MOST_TYPED]  # the card is drawn anew with every point
         elif action == "back":
             self.take_back()
         elif action == "next":
@@ -170,21 +184,25 @@ class Marking:
         session, display = self._tab.require_session(), self._tab.studio.display
         if display is None:
             return True
-        hit = display.picking.pick(click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
+        spacing = display.picking.spacing
+        hit, is_between = _picked(display.picking, click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
         if hit is None:
-            raise StudioError("There is no point of the cloud there.", "Click on the cloud itself; zoom in if need be.")
+            raise StudioError(*_NOTHING_THERE)
         centre = click.ray_origin + hit.depth * click.ray_direction
         pixel = click.view.pixel_angle_rad * hit.depth
-        spacing = display.picking.spacing
         half_width = float(np.clip(_CLOSE_UP_PX * pixel, _LEAST_SPACINGS * spacing, _MOST_SPACINGS * spacing))
-        self._look_closely(session, centre, _towards(click.ray_direction, click.view.rotation[1]), half_width)
-        surface = self.close_up.surface_at(0.5, 0.5, pointing_sigma=_HIT_PX * pixel) if self.close_up else None
-        if surface is None:
-            raise StudioError("There is no point of the cloud there.", "Click on the cloud itself.")
+        half_width = max(half_width, 1.5 * hit.offset)
+        close_up = self._seen_closely(
+            session, centre, _towards(click.ray_direction, click.view.rotation[1]), half_width
+        )
+        surface = close_up.surface_at(0.5, 0.5, pointing_sigma=_HIT_PX * pixel)
+        if surface is None or (is_between and hit.offset > _BETWEEN_SPACINGS * close_up.spacing):
+            raise StudioError(*_NOTHING_THERE)
+        rotation = close_up.rotation
         if surface.normal is not None:
             # Squarely, so that a corner on the ground is as easy to hit as one on a wall.
             rotation = _towards(-surface.normal, click.view.rotation[1])
-            self._look_closely(session, surface.xyz, rotation, half_width)
+        self._look_closely(session, surface.xyz, rotation, half_width)
         self._put(session, picks, target, surface.xyz, surface.sigma, source_of(session, click.ray_origin))
         return True
 
@@ -204,7 +222,11 @@ class Marking:
 
     def _look_closely(self, session: Session, centre: Float64, rotation: Float64, half_width: float) -> None:
         self._frame = session.document
-        self.close_up = CloseUp.of(session.points_world(self._frame), session.cloud.rgb, centre, rotation, half_width)
+        self.close_up = self._seen_closely(session, centre, rotation, half_width)
+
+    @staticmethod
+    def _seen_closely(session: Session, centre: Float64, rotation: Float64, half_width: float) -> CloseUp:
+        return CloseUp.of(session.points_world(), session.cloud.rgb, centre, rotation, half_width)
 
     def _refine(self, action: str, x: float, y: float) -> None:
         """Put the chosen point at a place of the close-up, or move it by pixels of it."""
@@ -268,11 +290,14 @@ class Marking:
 
     # ---- in photos
 
-    def _posed(self) -> PosedImages:
+    def _cameras(self) -> Cameras:
         cameras = self._tab.require_session().cameras
         if cameras is None:
             raise StudioError("This plot has no photos yet.", "Add them under Photos, or click in the cloud instead.")
-        return cameras.posed
+        return cameras
+
+    def _posed(self) -> PosedImages:
+        return self._cameras().posed
 
     def photo_clicked(self, image: str, u_px: float, v_px: float) -> None:
         """A place of a photo was clicked; pixels of its camera."""
@@ -294,7 +319,7 @@ class Marking:
             return None
         pixel = float(np.linalg.norm(rays[1] - rays[0])) if np.isfinite(rays[1]).all() else 1e-3
         start, direction = world_of(session, origin)[0], direction_in_world(session, rays[0])
-        hit = display.picking.pick(start, direction, pixel)
+        hit, _ = _picked(display.picking, start, direction, pixel)
         return None if hit is None else source_of(session, start + hit.depth * direction)
 
     def _open_photo(self, name: str) -> None:
@@ -362,7 +387,7 @@ class Marking:
         return marking_html.marking_card(
             picks,
             scale=session.document.scale,
-            typed_m=self.typed_m(),
+            typed=self._offered_text(session, picks),
             close_up=self.close_up,
             cross=cross,
             offered=offered,
@@ -422,6 +447,18 @@ class Marking:
             for number, pick in enumerate(self.picks.picks)
             if pick.point is not None
         ]
+
+
+def _picked(cloud: PickCloud, *ray: Any) -> tuple[PickHit | None, bool]:
+    """What lies on a ray (origin, direction, angle of a pixel), and whether only near it: between sparse points."""
+    hit = cloud.pick(*ray)
+    if hit is not None:
+        return hit, False
+    for reach in _SPARSE_SPACINGS:
+        hit = cloud.pick(*ray, radius=reach * cloud.spacing)
+        if hit is not None:
+            break
+    return hit, True
 
 
 def _towards(direction: Float64, down: Float64) -> Float64:

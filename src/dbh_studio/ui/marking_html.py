@@ -14,7 +14,6 @@ from dbh_studio.core.close_up import CloseUp
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.ui.bridge import call, esc, js
 from dbh_studio.ui.point_picks import PointPicks
-from dbh_studio.ui.scale_html import metres
 
 CLOSE_UP_PX = 260
 
@@ -53,7 +52,7 @@ def marking_card(
     picks: PointPicks,
     *,
     scale: ScaleEstimate,
-    typed_m: float,
+    typed: str,
     close_up: CloseUp | None,
     cross: tuple[float, float] | None,
     offered: Sequence[Suggestion],
@@ -64,7 +63,7 @@ def marking_card(
     Args:
         picks: They.
         scale: For distances in metres.
-        typed_m: The length offered in the field.
+        typed: What stands in the field of the true length.
         close_up: The surroundings of the chosen point, enlarged.
         cross: Where the chosen point is in them, 0..1.
         offered: Photos that should show the chosen point too.
@@ -93,12 +92,17 @@ def marking_card(
         title = "Side of the black square" if picks.kind == "square" else "True length"
         parts.append(
             f'<div class="dbh-keep"><label class="dbh-field"><span>{title}</span><span class="dbh-metres">'
-            f'<input type="text" inputmode="decimal" size="6" value="{metres(typed_m)}" data-field="keep" '
+            f'<input type="text" inputmode="decimal" size="6" value="{esc(typed)}" data-field="keep" '
+            f'oninput="{_typed()}" '
             'onkeydown="event.stopPropagation();if(event.key===&#39;Enter&#39;)'
             'this.closest(&#39;.dbh-keep&#39;).querySelector(&#39;button&#39;).click()"> m</span></label>'
             f'<button type="button" data-do="keep" onclick="{_keep()}">Keep it</button></div>'
         )
     return "".join(parts) + "</div>"
+
+
+def _typed() -> str:
+    return esc(f"dbh({js('mark')},[{js('typed')},this.value])")
 
 
 def _keep() -> str:

@@ -32,11 +32,12 @@ window.dbhPhoto = window.dbhPhoto || (() => {
   image.draggable = false;
   let shown = false, isLarge = false, frame = 0, waiting = 0, asked = null, size = '', held = null, wheel = null, pan = null;
 
+  let again = 0;
   const slot = () => document.querySelector('.dbh-photo-slot');
   function place() {
     if (!shown) { root.remove(); return; }
     const home = isLarge ? document.body : slot();
-    if (!home) { setTimeout(place, 50); return; }
+    if (!home) { clearTimeout(again); again = setTimeout(place, 100); return; }
     if (root.parentNode !== home) home.appendChild(root);
     root.dataset.large = isLarge;
     if (isLarge) {

@@ -8,7 +8,7 @@ import viser
 
 from dbh_studio.app import commands
 from dbh_studio.app.cameras import Cameras
-from dbh_studio.errors import StudioError
+from dbh_studio.errors import FileError, StudioError
 from dbh_studio.ui import html
 from dbh_studio.ui.panels.base import set_content, set_disabled, set_value, set_visible, typed_path
 from dbh_studio.ui.photo_desk import FORMATS
@@ -78,8 +78,11 @@ class PhotosSection:
             content = describe(cameras)
         elif source is not None and desk.problem is not None:
             problem = desk.problem
+            said = f"{source.path.name}: {problem.problem}" if isinstance(problem, FileError) else problem.problem
             content = html.message(
-                f"The photos of this plot cannot be shown. {problem}", level="stop", remedy=problem.remedy
+                f"The photos of this plot cannot be shown. {said}",
+                level="stop",
+                remedy=f"{problem.remedy} If they were moved, type where they are now and read them again.",
             )
         elif source is not None:
             content = html.message("The photos of this plot have not been read yet.")

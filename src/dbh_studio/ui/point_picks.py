@@ -62,6 +62,7 @@ class PointPicks:
         chosen: The point that the next click in a photo, or the close-up, is about.
         is_moving: The next click in the cloud moves the chosen point and adds none.
         seen_from_src: From where the first point was seen.
+        typed: The true length as it stands in the page; None while nobody has touched it.
     """
 
     kind: LengthKind
@@ -72,6 +73,7 @@ class PointPicks:
     chosen: int = 0
     is_moving: bool = False
     seen_from_src: Float64 | None = None
+    typed: str | None = None
 
     def __post_init__(self) -> None:
         self.picks = self.picks or [Pick() for _ in POINT_NAMES[self.kind]]

@@ -50,7 +50,7 @@ def state(scale: ScaleEstimate, report: ScaleReport | None, size: str) -> str:
         if report is not None and report.estimate is not None:
             return html.message(
                 f"Not applied yet. The known lengths say 1 unit = {report.estimate.metres_per_unit:.5g} m"
-                f"{_error(report.estimate)}.",
+                f"{_error(report.estimate)}.{_doubt(report)}",
                 remedy="Press Set the scale from the known lengths.",
             ) + _facts(size)
         return f'<div class="dbh">{html.facts([("1 unit is", "not known yet"), ("The plot is", size or "–")])}</div>'
@@ -68,7 +68,7 @@ def state(scale: ScaleEstimate, report: ScaleReport | None, size: str) -> str:
     difference = 100 * (report.estimate.metres_per_unit / scale.metres_per_unit - 1)
     text = (
         f"In use: {said} The known lengths below say {report.estimate.metres_per_unit:.6g} m"
-        f"{_error(report.estimate)}, {signed(difference, 2)} %. That is not applied."
+        f"{_error(report.estimate)}, {signed(difference, 2)} %. That is not applied.{_doubt(report)}"
     )
     return html.message(text) + _facts(size)
 
@@ -81,6 +81,13 @@ def is_applied(scale: ScaleEstimate, report: ScaleReport) -> bool:
         and scale.source == estimate.source
         and abs(scale.metres_per_unit / estimate.metres_per_unit - 1) < 1e-9
     )
+
+
+def _doubt(report: ScaleReport) -> str:
+    """What stands against the known lengths, before they are applied."""
+    verdict = report.verdict
+    is_doubtful = verdict.level == "caution" and verdict.code != "unchecked"
+    return f" {verdict.message}" if is_doubtful else ""
 
 
 def _error(scale: ScaleEstimate) -> str:

@@ -12,7 +12,7 @@ from dbh_studio.app.scaling import change_side
 from dbh_studio.app.session import Session
 from dbh_studio.core.scale_evidence import MarkerSquare
 from dbh_studio.ui import scale_html
-from dbh_studio.ui.panels.base import set_content, set_disabled
+from dbh_studio.ui.panels.base import set_content, set_disabled, show_anew
 
 if TYPE_CHECKING:
     from dbh_studio.stages.marker_detect import Detection
@@ -39,10 +39,12 @@ class MarkerSection:
 
     def refresh(self, session: Session) -> None:
         """Show the side, and why markers were left out."""
+        sides = Counter(s.side_m for s in session.document.evidence.squares if s.marker is not None)
         if session is not self._side_of:
-            self._side_of = session
-            sides = Counter(s.side_m for s in session.document.evidence.squares if s.marker is not None)
-            self._side_m = sides.most_common(1)[0][0] if sides else _DEFAULT_SIDE_M
+            self._side_of, self._side_m = session, _DEFAULT_SIDE_M
+        if sides and self._side_m not in sides:
+            # After Undo, or where another tab or the list below gave them another.
+            self._side_m = sides.most_common(1)[0][0]
         set_content(self._side, scale_html.side_input(self._side_m))
         finds, markers = self._tab.studio.markers.of(session), self._tab.studio.markers
         text = scale_html.problems(markers.problems)
@@ -87,7 +89,7 @@ class MarkerSection:
             session.do(change_side(session.document, before, side_m))
         finally:
             # What was typed stands in the page only: the field shows again what is in use.
-            self._side.content = scale_html.side_input(self._side_m)
+            show_anew(self._side, scale_html.side_input(self._side_m))
 
     def _used(self, payload: Any) -> None:
         if not isinstance(payload, list) or len(payload) != 3:
@@ -95,7 +97,7 @@ class MarkerSection:
         dictionary, number, text = payload
         if isinstance(dictionary, str) and isinstance(number, int) and isinstance(text, str):
             side_m = metres_from_text(text, "The side of the black square")
-            self._tab.studio.markers.use(self._tab.require_session(), (dictionary, number), side_m)
+            self._tab.studio.markers.use(self._tab.require_session(), (dictionary, number), side_m, self._side_m)
 
     def _struck(self, payload: Any) -> None:
         if (
@@ -109,4 +111,4 @@ class MarkerSection:
         image, dictionary, number = payload[0]
         if isinstance(image, str) and isinstance(dictionary, str) and isinstance(number, int):
             session = self._tab.require_session()
-            self._tab.studio.markers.strike(session, (image, dictionary, number), struck=payload[1])
+            self._tab.studio.markers.strike(session, (image, dictionary, number), self._side_m, struck=payload[1])

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from dbh_studio.app import commands
-from dbh_studio.app.cameras import Cameras
+from dbh_studio.app.cameras import Cameras, require_fit
 from dbh_studio.app.lengths import metres_from_text
 from dbh_studio.app.scaling import scale_from_baseline, scale_from_camera_height
 from dbh_studio.app.session import Session
@@ -127,6 +127,7 @@ class NumberSection:
         cameras = session.cameras
         if cameras is None:
             raise StudioError("This plot has no photos.", "Choose another way.")
+        require_fit(cameras)
         if choice == _BY_HEIGHT:
             height_m = metres_from_text(self._height.value, "The height of the camera")
             up = np.array(session.document.up_direction)

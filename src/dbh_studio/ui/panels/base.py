@@ -57,6 +57,11 @@ def set_content(handle: Any, content: str) -> None:
         handle.content = content
 
 
+def show_anew(handle: Any, content: str) -> None:
+    """Assign HTML so that the page draws it again though it is the same: what was typed into its fields goes."""
+    handle.content = content if content != handle.content else content + " "
+
+
 def set_disabled(handle: Any, disabled: bool) -> None:
     """Lock or release an input, where it is not so already."""
     if handle.disabled != disabled:

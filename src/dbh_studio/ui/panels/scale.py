@@ -14,7 +14,7 @@ from dbh_studio.app.session import Session
 from dbh_studio.core.bars import BarRole, ScaleReport
 from dbh_studio.core.scale_evidence import MarkerSquare, ScaleBar, ScaleEvidence
 from dbh_studio.ui import html, marking_html, scale_html
-from dbh_studio.ui.panels.base import Panel, set_content, set_visible
+from dbh_studio.ui.panels.base import Panel, set_content, set_visible, show_anew
 from dbh_studio.ui.photos_section import PhotosSection
 from dbh_studio.ui.scale_markers import MarkerSection
 from dbh_studio.ui.scale_number import NumberSection
@@ -204,7 +204,7 @@ class ScalePanel(Panel):
             self.tab.require_session().do(commands.change_length(length.name, **{field: true_m}))
         except BaseException:
             # What was typed stands in the page only: the field shows again what is kept.
-            self._lengths.content = self._lengths.content + " "
+            show_anew(self._lengths, self._lengths.content)
             raise
 
     def _chose_role(self, payload: Any) -> None:
