@@ -1,0 +1,330 @@
+"""How well each method measures stems of known girth: a table per scenario, and the interval's calibration.
+
+    python bench/estimator_lab.py                        the benchmark: 40 stems per scenario, seeds from 10 000
+    python bench/estimator_lab.py --development          the same on seeds below 1000, for choosing and calibrating
+    python bench/estimator_lab.py --calibrate            fit the interval's coefficients on development seeds
+    python bench/estimator_lab.py --real [FOLDER]        eight real slices with a tape, whole and cut to arcs
+
+Every method gets the same stretch of stem, the same axis (a round tube fitted to 0.8-2.0 m), a band about 1.30 m where
+it works in a band (30 cm for the paper's curves as in the paper, 60 cm for circles, the better of the two), and one
+factor and one tolerance of its own, chosen on development seeds (`TUNED`). For the errors nobody may refuse; refusals
+and coverage are counted with the settings as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from estimator_stems import SCENARIOS, make_case
+from scipy.optimize import minimize
+
+from dbh_studio.core.axis import StemAxis
+from dbh_studio.core.dbh import CurveFit, measure_stem
+from dbh_studio.core.estimator import EstimatorResult, estimate_diameter
+from dbh_studio.core.estimator.fit import fit_tube
+from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
+from dbh_studio.core.estimator.prior import StemPrior
+from dbh_studio.core.estimator.search import find_rings
+from dbh_studio.core.estimator.tube import Tube
+from dbh_studio.core.robust import Circle
+from dbh_studio.io.pcd import read_pcd
+from dbh_studio.settings import EstimatorSettings, MeasureSettings
+
+DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "treescope_trunk_slices"
+RESULTS = Path(__file__).resolve().parent / "results"
+_LOST = 1.0  # relative error of a method that finds nothing
+_FACTOR = 1.645
+_AIM = 0.915
+_BARK = 0.005
+_NOTHING = -9.0  # logarithm of a coefficient that does nothing
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method says; NaN where nothing."""
+
+    value_cm: float
+    low_cm: float = np.nan
+    high_cm: float = np.nan
+    refused: bool = False
+    ms: float = 0.0
+    spread: Spread | None = None
+    flags: tuple[str, ...] = ()
+
+
+# Tolerance in metres and factor on the diameter, by method, both chosen on development seeds 300-311 (the spline's on
+# three of them): of 2, 3 and 5 cm the best (Fourier does not care), and what brings the median ratio to one. Circles
+# take theirs from the settings.
+TUNED = {"fourier": (0.02, 1.002), "ellipse": (0.02, 1.012), "bspline": (0.02, 0.95)}
+
+Method = Callable[[np.ndarray], Answer]
+
+
+def shared_axis(points: np.ndarray) -> StemAxis | None:
+    """The axis all methods get: that of a round tube on the stretch the estimator uses."""
+    settings = EstimatorSettings()
+    window = points[(points[:, 2] > 0.8) & (points[:, 2] < 2.0)]
+    if len(window) < settings.min_points:
+        return None
+    origin = np.array([*np.median(window[:, :2], axis=0), 1.3])
+    rng = np.random.default_rng(1)
+    local = window[rng.permutation(len(window))[:2500]] - origin
+    rings, _ = find_rings(local, widest_m=1.25, taper=settings.taper, rng=rng)
+    if not len(rings.radius):
+        return None
+    start = Tube(rings.middles()[0], rings.slope[0], float(rings.radius[0]), 0.0, np.empty(0), float(rings.sigma[0]))
+    tube = fit_tube(local, start, StemPrior.from_settings(settings), highest=1)
+    if tube is None:
+        return None
+    _, _, direction = tube.frame()
+    point = origin + np.array([*tube.centre, 0.0])
+    return StemAxis(point, direction, Circle(point[:2], tube.radius, tube.sigma), "stem")
+
+
+def paper_curve(name: str, *, tolerance_m: float | None = None) -> Method:
+    tolerance, factor = TUNED[name]
+    settings = MeasureSettings(
+        curve=name,  # type: ignore[arg-type]
+        band_below_m=0.15,
+        band_above_m=0.15,
+        definition="tape",
+        ransac_tolerance_m=tolerance if tolerance_m is None else tolerance_m,
+        min_coverage_deg=0.0,
+        min_points=8,
+    )
+
+    def measure(points: np.ndarray) -> Answer:
+        axis = shared_axis(points)
+        start = time.process_time()
+        result = measure_stem(points, settings=settings, curves=[name], axis=axis)
+        ms = 1000 * (time.process_time() - start)
+        fit = result.fits.get(name)
+        if not isinstance(fit, CurveFit):
+            return Answer(np.nan, refused=True, ms=ms)
+        return Answer(100 * factor * fit.diameter_m("tape"), refused=result.section.coverage_deg < 90.0, ms=ms)
+
+    return measure
+
+
+def estimator(*, drift_m: float = 0.0, **values: object) -> Method:
+    settings = EstimatorSettings(**values)  # type: ignore[arg-type]
+    open_to_all = settings.changed(max_half_width=2.0, min_points=15, min_arc_deg=0.0)
+
+    def measure(points: np.ndarray) -> Answer:
+        start = time.process_time()
+        result = estimate_diameter(points, settings=open_to_all, drift_m=drift_m)
+        ms = 1000 * (time.process_time() - start)
+        if not isinstance(result, EstimatorResult):
+            return Answer(np.nan, refused=True, ms=ms)
+        chosen = result.chosen
+        half = float(np.log(chosen.high_cm / chosen.value_cm))
+        flags = tuple(flag.code for flag in result.flags)
+        refused = half > settings.max_half_width or result.arc_deg < settings.min_arc_deg
+        return Answer(chosen.value_cm, chosen.low_cm, chosen.high_cm, refused, ms, result.spread, flags)
+
+    return measure
+
+
+METHODS: dict[str, Method] = {
+    "Fourier": paper_curve("fourier"),
+    "ellipse": paper_curve("ellipse"),
+    "spline": paper_curve("bspline"),
+    "circle": estimator(method="circle", bloat_chance=0.0),
+    "circle, upright": estimator(method="circle", axis="vertical", bloat_chance=0.0),
+    "circle, bloat": estimator(method="circle"),
+    "round tube": estimator(roundness=1e-4),
+    "ring": estimator(),
+}
+
+
+def run(methods: dict[str, Method], seeds: range, scenarios: list[str]) -> dict[str, dict[str, list[tuple]]]:
+    """Truth and answer of every method on every stem of every scenario."""
+    found: dict[str, dict[str, list[tuple]]] = {name: {s: [] for s in scenarios} for name in methods}
+    for scenario in scenarios:
+        start = time.time()
+        for seed in seeds:
+            case = make_case(scenario, seed)
+            for name, method in methods.items():
+                found[name][scenario].append((case.tape_cm, method(case.points_m)))
+        print(f"{scenario}: {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+    return found
+
+
+@dataclass(frozen=True)
+class Score:
+    bias: float
+    median: float
+    p90: float
+    rmse: float
+    gross: float
+    coverage: float
+    width: float
+    refused: float
+    ms: float
+
+
+def score(rows: list[tuple]) -> Score:
+    """Percentages, but `ms`. Coverage and width are of what is not refused."""
+    truth = np.array([row[0] for row in rows])
+    answers = [row[1] for row in rows]
+    value = np.array([answer.value_cm for answer in answers])
+    error = np.where(np.isfinite(value), value / truth - 1.0, -_LOST)
+    given = [(t, a) for t, a in zip(truth, answers, strict=True) if not a.refused and np.isfinite(a.low_cm)]
+    inside = [a.low_cm <= t <= a.high_cm for t, a in given]
+    width = [(a.high_cm - a.low_cm) / a.value_cm for _, a in given]
+    size = np.abs(error)
+    return Score(
+        100 * float(np.median(error)),
+        100 * float(np.median(size)),
+        100 * float(np.quantile(size, 0.9)),
+        100 * float(np.sqrt(np.mean(np.minimum(size, 1.0) ** 2))),
+        100 * float((size > 0.25).mean()),
+        100 * float(np.mean(inside)) if inside else np.nan,
+        100 * float(np.median(width)) if width else np.nan,
+        100 * float(np.mean([answer.refused for answer in answers])),
+        float(np.median([answer.ms for answer in answers])),
+    )
+
+
+def print_tables(found: dict[str, dict[str, list[tuple]]]) -> None:
+    methods, scenarios = list(found), list(next(iter(found.values())))
+    print("\nMedian |relative error| % (90th percentile)\n")
+    print("| scenario | " + " | ".join(methods) + " |\n|---" + "|--:" * len(methods) + "|")
+    for scenario in [*scenarios, "all"]:
+        cells = []
+        for name in methods:
+            s = score(_rows(found[name], scenario))
+            cells.append(f"{s.median:.2f} ({s.p90:.1f})")
+        print(f"| {scenario} | " + " | ".join(cells) + " |")
+    print("\nbias % / RMSE % / off by over 25 %, all scenarios; ms\n")
+    print("| method | bias | RMSE | gross | ms |\n|---|--:|--:|--:|--:|")
+    for name in methods:
+        s = score(_rows(found[name], "all"))
+        print(f"| {name} | {s.bias:+.2f} | {s.rmse:.1f} | {s.gross:.1f} | {s.ms:.0f} |")
+    for name in methods:
+        if not np.isfinite(score(_rows(found[name], "all")).coverage):
+            continue
+        print(f"\n{name}: the 90 % interval\n")
+        print("| scenario | bias % | median % | RMSE % | holds the tape % | width % | refused % | ms |")
+        print("|---" + "|--:" * 7 + "|")
+        for scenario in [*scenarios, "all"]:
+            s = score(_rows(found[name], scenario))
+            errors = f"{s.bias:+.2f} | {s.median:.2f} | {s.rmse:.1f}"
+            print(f"| {scenario} | {errors} | {s.coverage:.0f} | {s.width:.1f} | {s.refused:.0f} | {s.ms:.0f} |")
+
+
+def _rows(by_scenario: dict[str, list[tuple]], scenario: str) -> list[tuple]:
+    return [row for rows in by_scenario.values() for row in rows] if scenario == "all" else by_scenario[scenario]
+
+
+def calibrate(rows: list[tuple]) -> Calibration:
+    """The coefficients for which, whatever the terms say, nine in ten errors are within the interval.
+
+    Quantile regression of ln |error| on ln of the half width: every stem counts alike, however wide its interval. Aimed
+    a little above nine in ten, because stems that were not fitted to are held less often.
+    """
+    used = [(t, a) for t, a in rows if a.spread is not None and not a.refused]
+    size = np.log([max(abs(np.log(a.value_cm / t)), 1e-4) for t, a in used])
+    terms = np.stack([a.spread.terms() for _, a in used]) ** 2
+
+    def loss(log_coefficients: np.ndarray) -> float:
+        over = size - np.log(_FACTOR) - 0.5 * np.log(terms @ np.exp(2 * log_coefficients))
+        return float(np.where(over > 0, _AIM * over, (_AIM - 1.0) * over).mean())
+
+    found = np.log([0.004, 0.002, 1.0, 0.3, 0.5, 2.0, 0.01, 0.5, 0.5, 0.3])
+    found[terms.max(axis=0) == 0] = _NOTHING
+    bounds = [(_NOTHING, 3.0) if term > 0 else (_NOTHING, _NOTHING + 1e-9) for term in terms.max(axis=0)]
+    for _ in range(4):
+        found = minimize(loss, found, method="Powell", bounds=bounds).x
+    coefficients = np.where(found < -7.5, 0.0, np.exp(found))
+    coefficients[0] = max(coefficients[0], _BARK)
+    return Calibration(tuple(float(f"{c:.3g}") for c in coefficients), _FACTOR)
+
+
+def treescope(folder: Path, methods: dict[str, Method]) -> None:
+    """The real slices: whole, then cut to arcs by azimuth, 4 arcs each."""
+    rows = list(csv.DictReader((folder / "reference.csv").read_text().splitlines()))
+    stems = []
+    for row in rows:
+        cloud = read_pcd(folder / row["file"]).cloud
+        stems.append((row["tree_id"], float(row["dbh_cm"]), cloud.xyz + cloud.origin))
+    print(
+        "| tree | tape cm | "
+        + " | ".join(methods)
+        + " | ring's interval |\n|---" * 1
+        + "|--:" * (len(methods) + 2)
+        + "|"
+    )
+    errors: dict[str, list[float]] = {name: [] for name in methods}
+    for tree, tape, points in stems:
+        answers = {name: method(points) for name, method in methods.items()}
+        for name, answer in answers.items():
+            errors[name].append(answer.value_cm - tape)
+        cells = " | ".join(f"{a.value_cm:.1f} ({a.value_cm - tape:+.1f})" for a in answers.values())
+        ring = answers["ring"]
+        held = "holds" if ring.low_cm <= tape <= ring.high_cm else "misses"
+        print(f"| {tree} | {tape:.1f} | {cells} | {ring.low_cm:.1f}-{ring.high_cm:.1f} {held} |")
+    for title, of in (("bias cm", np.mean), ("RMSE cm", lambda e: np.sqrt(np.mean(np.square(e))))):
+        cells = " | ".join(f"{of(np.array(errors[name])):.2f}" for name in methods)
+        print(f"| {title} | | {cells} | |")
+    print("\nCut to an arc, 4 arcs of each stem: median % (90th percentile) [bias]; held, refused: of the ring\n")
+    print(
+        "| arc | " + " | ".join(methods) + " | held % | width % | refused % |\n|---" + "|--:" * (len(methods) + 3) + "|"
+    )
+    for arc in (270, 220, 180, 150, 120, 90):
+        results: dict[str, list[tuple]] = {name: [] for name in methods}
+        for _, tape, points in stems:
+            for middle in np.arange(4) * (np.pi / 2) + 0.4:
+                cut = _cut(points, middle, arc)
+                for name, method in methods.items():
+                    results[name].append((tape, method(cut)))
+        scores = {name: score(answers) for name, answers in results.items()}
+        cells = " | ".join(f"{s.median:.1f} ({s.p90:.0f}) [{s.bias:+.1f}]" for s in scores.values())
+        ring_score = scores["ring"]
+        print(f"| {arc} | {cells} | {ring_score.coverage:.0f} | {ring_score.width:.0f} | {ring_score.refused:.0f} |")
+
+
+def _cut(points: np.ndarray, middle: float, arc_deg: float) -> np.ndarray:
+    axis = shared_axis(points)
+    centre = axis.point_m[:2] if axis is not None else np.median(points[:, :2], axis=0)
+    angle = np.arctan2(points[:, 1] - centre[1], points[:, 0] - centre[0])
+    off = np.abs((angle - middle + np.pi) % (2 * np.pi) - np.pi)
+    return points[off <= np.radians(arc_deg / 2)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-n", type=int, default=40, help="stems per scenario")
+    parser.add_argument("--first", type=int, default=0, help="skip so many seeds")
+    parser.add_argument("--development", action="store_true")
+    parser.add_argument("--calibrate", action="store_true")
+    parser.add_argument("--real", nargs="?", const=DEFAULT_FOLDER, type=Path)
+    parser.add_argument("--methods", nargs="*", default=list(METHODS))
+    parser.add_argument("--scenarios", nargs="*", default=list(SCENARIOS))
+    options = parser.parse_args()
+    if options.real:
+        treescope(options.real, {name: METHODS[name] for name in options.methods})
+        return
+    first = (1 if options.development or options.calibrate else 10_000) + options.first
+    names = ["ring", "circle, bloat"] if options.calibrate else options.methods
+    found = run({name: METHODS[name] for name in names}, range(first, first + options.n), options.scenarios)
+    if options.calibrate:
+        for name in names:
+            print(name, calibrate(_rows(found[name], "all")), "now", CALIBRATIONS[name.split(",")[0]])
+        return
+    print_tables(found)
+    RESULTS.mkdir(exist_ok=True)
+    table = {name: {s: vars(score(rows)) for s, rows in by.items()} for name, by in found.items()}
+    (RESULTS / "estimator_lab.json").write_text(json.dumps(table, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""Where the stem is among leaves, stubs, ground and neighbours: several rings are tried and the likeliest is taken.
+
+Three-point circles in slices of the stem start leaning tubes, all refined at once; a tube is judged by the likelihood
+of all points under "a noisy ring and, everywhere else, clutter, but hardly any inside, for stems are opaque".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from dbh_studio.core.arrays import Bool, Float64, Int64
+
+_SLICES = 5
+_HYPOTHESES = 80  # per slice
+_SLICE_POINTS = 220
+_POINTS = 700
+_KEPT_PER_SLICE = 3
+_FINALISTS = 5
+_REACHES_M = np.array([0.12, 0.3, 0.7, np.inf])
+_TOLERANCES_M = (0.012, 0.03)
+_N_BINS = 24
+_INSIDE = 0.05  # density of clutter inside a stem, relative to outside
+_LEAN_SD = 0.12
+_SMALLEST_M = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """H leaning rings.
+
+    Attributes:
+        centre: (H, 2) at height `h0`.
+        slope: (H, 2) horizontal metres per metre of height.
+        radius: (H,) at breast height.
+        sigma: (H,) standard deviation of their points.
+        h0: (H,) height the centre belongs to.
+    """
+
+    centre: Float64
+    slope: Float64
+    radius: Float64
+    sigma: Float64
+    h0: Float64
+
+    def at(self, rows: Int64 | slice) -> Rings:
+        """Some of them."""
+        return Rings(self.centre[rows], self.slope[rows], self.radius[rows], self.sigma[rows], self.h0[rows])
+
+    def middles(self) -> Float64:
+        """(H, 2) centres at breast height."""
+        return self.centre - self.slope * self.h0[:, None]
+
+
+def find_rings(points: Float64, *, widest_m: float, taper: float, rng: np.random.Generator) -> tuple[Rings, Float64]:
+    """The likeliest rings, best first, and their log-likelihoods; none where nothing is round.
+
+    Args:
+        points: (N, 3) points, z from breast height, x and y near zero.
+        widest_m: Largest radius considered.
+        taper: Expected loss of radius, metres per metre, of stems thicker than 30 cm.
+        rng: Source of the samples.
+    """
+    low, high = np.quantile(points[:, 2], [0.01, 0.99])
+    window = (max(float(low), -0.40), min(float(high), 0.50))
+    start = _starts(points, window, widest_m, rng)
+    if not len(start):
+        nothing = np.empty(0)
+        return Rings(np.empty((0, 2)), np.empty((0, 2)), nothing, nothing, nothing), nothing
+    near = points[(points[:, 2] >= window[0]) & (points[:, 2] <= window[1])]
+    used = near if len(near) >= 60 else points
+    used = used if len(used) <= _POINTS else used[rng.permutation(len(used))[:_POINTS]]
+    some = used[: len(used) if len(used) < 60 else max(60, len(used) // 2)]
+    sigma = np.minimum(0.025, 0.25 * start[:, 2] + 0.003)
+    rings = Rings(start[:, :2], np.zeros((len(start), 2)), start[:, 2], sigma, start[:, 3])
+    rings = _refined(rings, some, (0.10, 0.14, 0.2, 0.3), widest_m, taper)
+    area = _box_area(used[:, :2])
+    best = _distinct(rings, np.argsort(-_likelihood(rings, some, area, taper), kind="stable"), _FINALISTS)
+    rings = _refined(rings.at(best), used, (0.3, 0.45, np.inf, np.inf, np.inf), widest_m, taper)
+    score = _likelihood(rings, used, area, taper)
+    order = np.argsort(-score, kind="stable")
+    order = _distinct(rings, order[np.isfinite(score[order])], _FINALISTS)
+    return rings.at(order), score[order]
+
+
+def _distinct(rings: Rings, order: Int64, n_most: int) -> Int64:
+    """The first rows of an order that are not the same ring as one before."""
+    place = np.column_stack([rings.middles(), rings.radius])
+    kept: list[int] = []
+    for row in order:
+        apart = np.abs(place[kept] - place[row]).sum(axis=1)
+        if (apart > 0.1 * np.minimum(place[kept, 2], place[row, 2])).all():
+            kept.append(int(row))
+            if len(kept) == n_most:
+                break
+    return np.array(kept, np.int64)
+
+
+def _starts(points: Float64, window: tuple[float, float], widest_m: float, rng: np.random.Generator) -> Float64:
+    """(H, 4) x, y, radius and height of distinct circles in the slices."""
+    edges = np.linspace(*window, _SLICES + 1)
+    found = []
+    for low, high in pairwise(edges):
+        piece = points[(points[:, 2] >= low) & (points[:, 2] < high), :2]
+        if len(piece) < 12:
+            continue
+        if len(piece) > _SLICE_POINTS:
+            piece = piece[rng.integers(0, len(piece), _SLICE_POINTS)]
+        circles = _slice_circles(piece, _HYPOTHESES, widest_m, rng)
+        found.append(np.column_stack([circles, np.full(len(circles), 0.5 * (low + high))]))
+    if not any(len(circles) for circles in found):  # too few per slice: all of them as one
+        piece = points[rng.permutation(len(points))[:250], :2]
+        circles = _slice_circles(piece, _SLICES * _HYPOTHESES, widest_m, rng)
+        found = [np.column_stack([circles, np.zeros(len(circles))])]
+    return np.concatenate(found)
+
+
+def _slice_circles(xy: Float64, n_hypotheses: int, widest_m: float, rng: np.random.Generator) -> Float64:
+    """(<= 3, 3) x, y and radius of the best circles that differ.
+
+    The other two points of a triple are drawn near the first, at several reaches: in a slice with three neighbours a
+    triple from anywhere is hardly ever of one stem.
+    """
+    x, y = xy.T
+    first = rng.integers(0, len(xy), n_hypotheses)
+    others = rng.integers(0, len(xy), (n_hypotheses, 10))
+    apart = (x[others] - x[first][:, None]) ** 2 + (y[others] - y[first][:, None]) ** 2
+    far = apart > (_REACHES_M[np.arange(n_hypotheses) % len(_REACHES_M)] ** 2)[:, None]
+    pair = np.argsort(far, axis=1, kind="stable")[:, :2]
+    second, third = np.take_along_axis(others, pair, axis=1).T
+    circles = _through(xy[first], xy[second], xy[third])
+    circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] > _SMALLEST_M) & (circles[:, 2] < widest_m)]
+    if not len(circles):
+        return circles
+    score = _slice_score(x, y, circles)
+    kept: list[Float64] = []
+    for circle in circles[np.argsort(-score, kind="stable")[:40]]:
+        if all(_apart(circle, other) > 0.3 * min(circle[2], other[2]) for other in kept):
+            kept.append(circle)
+            if len(kept) == _KEPT_PER_SLICE:
+                break
+    return np.array(kept)
+
+
+def _apart(one: Float64, other: Float64) -> float:
+    return float(np.hypot(one[0] - other[0], one[1] - other[1]) + abs(one[2] - other[2]))
+
+
+def _through(a: Float64, b: Float64, c: Float64) -> Float64:
+    """(H, 3) centre and radius of circles through three (H, 2) points; not finite where these are on a line."""
+    p, q = (b - a).T, (c - a).T
+    doubled = 2.0 * (p[0] * q[1] - p[1] * q[0])
+    p2, q2 = p[0] ** 2 + p[1] ** 2, q[0] ** 2 + q[1] ** 2
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        x, y = (q[1] * p2 - p[1] * q2) / doubled, (p[0] * q2 - q[0] * p2) / doubled
+        return np.column_stack([a[:, 0] + x, a[:, 1] + y, np.sqrt(x * x + y * y)])
+
+
+def _slice_score(x: Float64, y: Float64, circles: Float64) -> Float64:
+    """(H,) support of the circles (MSAC), less the points inside, made comparable between small and large circles."""
+    dx, dy = x - circles[:, :1], y - circles[:, 1:2]
+    radius = circles[:, 2:]
+    error = np.sqrt(dx * dx + dy * dy) - radius
+    area = _box_area(np.column_stack([x, y]))
+    score = np.full(len(circles), -np.inf)
+    for tolerance in _TOLERANCES_M:
+        width = np.minimum(tolerance, 0.25 * radius + 0.004)
+        ratio = error / width
+        support = (np.maximum(1.0 - ratio * ratio, 0.0) - 0.5 * (ratio < -2.5)).sum(axis=1)
+        rarity = 1.0 + np.log1p(area / (4 * np.pi * radius * width))[:, 0]
+        score = np.maximum(score, support * rarity)
+    return score
+
+
+def _box_area(xy: Float64) -> float:
+    low, high = np.quantile(xy, [0.04, 0.96], axis=0)
+    return float(np.prod(high - low + 0.2))
+
+
+def offsets(rings: Rings, points: Float64, taper: float) -> tuple[Float64, Float64, Float64, Float64]:
+    """(H, N) arrays: height over the rings' own, unit vector outwards (x, y), distance to their surface."""
+    height = points[:, 2] - rings.h0[:, None]
+    dx = points[:, 0] - rings.centre[:, :1] - rings.slope[:, :1] * height
+    dy = points[:, 1] - rings.centre[:, 1:] - rings.slope[:, 1:] * height
+    distance = np.sqrt(dx * dx + dy * dy) + 1e-9
+    thinner = (0.8 * taper * np.minimum(1.0, rings.radius / 0.15))[:, None] * points[:, 2]
+    return height, dx / distance, dy / distance, distance - rings.radius[:, None] + thinner
+
+
+def _refined(rings: Rings, points: Float64, reaches: tuple[float, ...], widest_m: float, taper: float) -> Rings:
+    """Robust Gauss-Newton on centre, slope and radius of all rings, with ever more of the stem."""
+    centre, slope, radius, sigma = rings.centre, rings.slope, rings.radius, rings.sigma
+    for reach in reaches:
+        now = Rings(centre, slope, radius, sigma, rings.h0)
+        height, out_x, out_y, error = offsets(now, points, taper)
+        weight = np.maximum(1.0 - (error / (4.2 * sigma)[:, None]) ** 2, 0.0) ** 2
+        if np.isfinite(reach):
+            weight *= np.maximum(1.0 - (height / (1.5 * reach)) ** 2, 0.0)
+        total = weight.sum(axis=1) + 1e-9
+        sigma = np.clip(
+            1.5 * (weight * np.abs(error)).sum(axis=1) / total, 0.003, np.minimum(0.04, 0.2 * radius + 0.003)
+        )
+        step = _step(slope, sigma, weight, total, np.stack([out_x, out_y, height * out_x, height * out_y], 1), error)
+        step *= np.minimum(1.0, 0.3 * radius / (np.abs(step[:, [0, 1, 4]]).max(axis=1) + 1e-9))[:, None]
+        centre = centre + step[:, :2]
+        slope = np.clip(slope + np.clip(step[:, 2:4], -0.25, 0.25), -0.6, 0.6)
+        radius = np.clip(radius + step[:, 4], 0.5 * _SMALLEST_M, 1.2 * widest_m)
+    return Rings(centre, slope, radius, sigma, rings.h0)
+
+
+def _step(slope: Float64, sigma: Float64, weight: Float64, total: Float64, place: Float64, error: Float64) -> Float64:
+    """(H, 5) Gauss-Newton steps, with a prior of upright stems."""
+    design = np.concatenate([place, np.ones_like(place[:, :1])], axis=1)
+    normal = np.matmul(design * weight[:, None], design.transpose(0, 2, 1))
+    ridge = np.array([1e-4, 1e-4, 0.0, 0.0, 1e-4]) * total[:, None] + 1e-9
+    ridge[:, 2:4] += (3.0 * sigma**2 / _LEAN_SD**2)[:, None]
+    normal[:, np.arange(5), np.arange(5)] += ridge
+    pull = np.matmul(design, (weight * error)[..., None])[..., 0]
+    pull[:, 2:4] -= ridge[:, 2:4] * slope
+    step: Float64 = np.linalg.solve(normal, pull[..., None])[..., 0]
+    return step
+
+
+def _likelihood(rings: Rings, points: Float64, area: float, taper: float) -> Float64:
+    """(H,) log-likelihood of all points; -inf for a ring of fewer than ten."""
+    _, out_x, out_y, error = offsets(rings, points, taper)
+    sigma = np.maximum(rings.sigma, 0.004)[:, None]
+    ratio = error / sigma
+    on: Bool = np.abs(ratio) < 3.0
+    n_on = on.sum(axis=1)
+    sector = ((np.arctan2(out_y, out_x) + np.pi) * (_N_BINS / (2 * np.pi))).astype(np.int64) % _N_BINS
+    sector += _N_BINS * np.arange(len(n_on))[:, None]
+    share = np.bincount(sector[on], minlength=_N_BINS * len(n_on)).reshape(-1, _N_BINS) + 0.2
+    share = share / share.sum(axis=1, keepdims=True)
+    # The arc that is really covered: a ring only explains what lies where its points are.
+    arc_m = np.exp(-(share * np.log(share)).sum(axis=1)) * (2 * np.pi / _N_BINS) * rings.radius
+    part = (n_on / len(points))[:, None]
+    ring = part * np.exp(-0.5 * ratio * ratio) / (2.5066 * sigma * arc_m[:, None])
+    clutter = np.where(ratio < -3.5, _INSIDE, 1.0) * (1.02 - part) / area
+    return np.where(n_on >= 10, np.log(ring + clutter).sum(axis=1), -np.inf)

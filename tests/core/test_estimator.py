@@ -1,0 +1,358 @@
+"""The estimator against stems of which the girth is known by formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+
+from dbh_studio.core.dbh import Refusal
+from dbh_studio.core.estimator import EstimatorResult, estimate_diameter
+from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
+from dbh_studio.core.estimator.posterior import N_OUTLINE
+from dbh_studio.core.estimator.sample import sample_points
+from dbh_studio.core.estimator.skew import surface_shift
+from dbh_studio.core.estimator.tube import Tube, cells_of, tukey, wave_basis
+from dbh_studio.errors import SettingError
+from dbh_studio.settings import EstimatorSettings
+
+SMOOTH = EstimatorSettings(bark_share=0.0)
+"""No bark: what is fitted is what a tape would lie on."""
+
+
+def stem(radius=0.2, n=3000, arc_deg=360.0, noise=0.004, taper=0.0, lean_deg=0.0, waves=(), z=(0.5, 2.3), seed=0):
+    """A leaning, tapering stem whose axis passes the origin at 1.30 m; waves are (order, relative size, phase)."""
+    rng = np.random.default_rng(seed)
+    t, w = np.radians(rng.uniform(-arc_deg / 2, arc_deg / 2, n)), rng.uniform(*z, n) - 1.3
+    shape = 1.0 + sum((size * np.cos(order * t - phase) for order, size, phase in waves), np.zeros(n))
+    r = radius * shape - taper * w + noise * rng.standard_normal(n)
+    lean = np.radians(lean_deg)
+    tilt = np.array([[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]])
+    return np.stack([r * np.cos(t), r * np.sin(t), w], axis=1) @ tilt.T + [0, 0, 1.3]
+
+
+def measured(points, **options) -> EstimatorResult:
+    result = estimate_diameter(points, **options)
+    assert isinstance(result, EstimatorResult), result
+    return result
+
+
+def codes(result: EstimatorResult) -> set[str]:
+    return {flag.code for flag in result.flags}
+
+
+class TestTruth:
+    @pytest.mark.parametrize("radius", [0.04, 0.2, 0.7])
+    def test_circle(self, radius):
+        result = measured(stem(radius, noise=0.01 * radius), settings=SMOOTH)
+        for name in ("tape", "curve", "area"):
+            assert result.diameters[name].value_cm == pytest.approx(200 * radius, rel=0.004)
+
+    def test_three_definitions_of_a_hollow_outline(self):
+        waves = ((2, 0.03, 0.3), (3, 0.22, 1.0))
+        result = measured(stem(0.3, n=8000, noise=0.001, waves=waves), settings=SMOOTH.changed(max_points=8000))
+        t = np.linspace(0, 2 * np.pi, 20001)
+        r = 0.3 * (1 + sum(size * np.cos(order * t - phase) for order, size, phase in waves))
+        x, y = r * np.cos(t), r * np.sin(t)
+        perimeter = np.hypot(np.diff(x), np.diff(y)).sum()
+        area = 0.5 * abs((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
+        facing = np.linspace(0, 2 * np.pi, 721)[:-1]
+        girth = np.mean([(x * np.cos(a) + y * np.sin(a)).max() for a in facing]) * 2 * np.pi  # Cauchy
+        assert girth < 0.994 * perimeter  # else this outline would test nothing
+        assert result.diameters["tape"].value_cm == pytest.approx(100 * girth / np.pi, rel=0.006)
+        assert result.diameters["curve"].value_cm == pytest.approx(100 * perimeter / np.pi, rel=0.006)
+        assert result.diameters["area"].value_cm == pytest.approx(200 * np.sqrt(area / np.pi), rel=0.006)
+
+    def test_taper_and_lean(self):
+        result = measured(stem(0.25, taper=0.012, lean_deg=15.0), settings=SMOOTH)
+        assert result.dbh_cm == pytest.approx(50.0, rel=0.004)  # at 1.30 m, not of the whole stretch
+        assert result.lean_deg == pytest.approx(15.0, abs=0.3)
+        assert result.taper_cm_per_m == pytest.approx(2.4, abs=0.3)
+        assert "lean" in codes(result)
+
+    def test_height_of_measurement(self):
+        points = stem(0.25, taper=0.012)
+        high = measured(points, settings=SMOOTH.changed(breast_height_m=1.4))
+        assert high.height_m == 1.4
+        assert high.dbh_cm == pytest.approx(50.0 - 0.24, abs=0.1)
+
+    def test_tape_lies_on_the_bark(self):
+        points = stem()
+        bare, barked = measured(points, settings=SMOOTH), measured(points, settings=SMOOTH.changed(bark_share=0.02))
+        assert barked.diameters["tape"].value_cm == pytest.approx(1.02 * bare.diameters["tape"].value_cm, rel=1e-9)
+        assert barked.diameters["area"] == bare.diameters["area"]
+
+    def test_half_a_ring(self):
+        half, whole = measured(stem(arc_deg=180, noise=0.006)), measured(stem(noise=0.006))
+        assert half.chosen.holds(40.0)
+        assert half.dbh_cm == pytest.approx(40.0, rel=0.04)
+        assert half.arc_deg == pytest.approx(180, abs=25)
+        assert half.gap_deg == pytest.approx(180, abs=25)
+        assert half.chosen.half_width > 1.3 * whole.chosen.half_width
+        assert "partial_arc" in codes(half)
+        assert "partial_arc" not in codes(whole)
+
+    def test_unseen_side_stays_round_and_unsure(self):
+        result = measured(stem(arc_deg=200, noise=0.003, waves=((2, 0.04, 0.0),)))
+        seen = result.outline_seen > 0
+        assert 30 <= seen.sum() <= 50
+        assert result.outline_sd_m[~seen].max() > 2.0 * result.outline_sd_m[seen].min()
+
+    def test_outline_lies_on_the_points(self):
+        result = measured(stem(lean_deg=10.0), settings=SMOOTH)
+        outline = np.column_stack([result.outline_uv_m, np.zeros(N_OUTLINE)])
+        placed = result.stem_from_section.apply(outline)
+        axis = np.array([np.sin(np.radians(10)), 0, np.cos(np.radians(10))])
+        offset = placed - [0, 0, 1.3]
+        np.testing.assert_allclose(offset @ axis, 0, atol=0.005)
+        np.testing.assert_allclose(np.linalg.norm(offset, axis=1), 0.2, atol=0.005)
+
+
+class TestRobust:
+    def test_ferns_stubs_and_a_bank(self):
+        rng = np.random.default_rng(5)
+        fern = np.column_stack([rng.normal(0.5, 0.15, (600, 2)), rng.uniform(0.3, 1.4, 600)])
+        along = rng.uniform(0.2, 0.7, (300, 1))
+        stub = along * [-0.9, 0.3, 0.2] + [0, 0, 1.3] + rng.normal(0, 0.01, (300, 3))
+        ground = np.column_stack([rng.uniform(-1, 1, (500, 2)), rng.uniform(0.3, 0.95, 500)])
+        ground = ground[np.hypot(ground[:, 0], ground[:, 1]) > 0.21]
+        points = np.concatenate([stem(arc_deg=220, n=1800), fern, stub, ground])
+        assert measured(points, settings=SMOOTH).dbh_cm == pytest.approx(40.0, rel=0.02)
+
+    def test_neighbour_is_not_averaged_but_said(self):
+        other = stem(0.15, n=1200, arc_deg=240, seed=1) + [0.38, 0.0, 0.0]
+        result = measured(np.concatenate([stem(n=3000), other]), settings=SMOOTH)
+        assert result.dbh_cm == pytest.approx(40.0, rel=0.015)
+        assert "neighbour" in codes(result)
+        assert "neighbour" not in codes(measured(stem()))
+
+    def test_bloated_bark(self):
+        points = stem(n=6000, noise=0.004)
+        out = points[:, :2] / np.linalg.norm(points[:, :2], axis=1, keepdims=True)
+        points[:, :2] += out * np.random.default_rng(2).exponential(0.015, (len(points), 1))
+        modelled = measured(points, settings=SMOOTH).dbh_cm
+        ignored = measured(points, settings=SMOOTH.changed(bloat_chance=0.0)).dbh_cm
+        assert ignored > 41.0
+        assert modelled == pytest.approx(40.0, abs=0.4)
+
+    def test_two_walls_are_said_and_widen_the_interval(self):
+        rng = np.random.default_rng(3)
+        first, second = stem(n=3000, arc_deg=230, noise=0.003), stem(n=3000, arc_deg=230, noise=0.003, seed=4)
+        second = second * [-1, 1, 1] + [0.0, 0.05, 0.0]  # the other side, by a pass that is 5 cm off
+        points = np.concatenate([first, second]) + rng.normal(0, 0.001, (6000, 3))
+        result = measured(points)
+        assert "double_wall" in codes(result)
+        assert result.chosen.half_width > 1.3 * measured(stem(n=6000, noise=0.003)).chosen.half_width
+
+    def test_bulge(self):
+        points = stem(n=6000)
+        height = np.abs(points[:, 2] - 1.3)
+        points[:, :2] *= 1.0 + 0.12 * (height < 0.12)[:, None]
+        assert "bulge" in codes(measured(points))
+        assert "bulge" not in codes(measured(stem(n=6000)))
+
+    def test_seen_only_above_breast_height(self):
+        result = measured(stem(0.2, taper=0.01, z=(1.5, 2.0)), settings=SMOOTH)
+        assert "not_at_height" in codes(result)
+        assert "not_at_height" not in codes(measured(stem()))
+        assert result.chosen.holds(40.0)
+
+    def test_root_swell(self):
+        assert "buttress" in codes(measured(stem(0.4, taper=0.06)))
+
+    def test_few_points_and_a_short_stretch(self):
+        result = measured(stem(n=70, z=(1.2, 1.4)))
+        assert {"few_points", "short_stretch"} <= codes(result)
+        assert result.chosen.holds(40.0)
+
+
+class TestSameAnswer:
+    def test_order_does_not_matter(self):
+        points = stem(n=9000)
+        shuffled = points[np.random.default_rng(1).permutation(len(points))]
+        first, second = estimate_diameter(points), estimate_diameter(shuffled)
+        assert first.diameters == second.diameters
+        np.testing.assert_array_equal(first.outline_uv_m, second.outline_uv_m)
+
+    def test_seed_decides(self):
+        points = stem(n=9000, noise=0.02)
+        assert measured(points).dbh_cm == measured(points).dbh_cm
+        assert measured(points).dbh_cm != measured(points, seed=1).dbh_cm
+        assert measured(points, seed=1).dbh_cm == measured(points, settings=EstimatorSettings(seed=1)).dbh_cm
+
+    def test_survey_coordinates(self):
+        points = stem(n=2000)  # fewer than are sampled, so the same points are used
+        moved = measured(points + [512_000.0, 5_403_000.0, 0.0])
+        assert moved.dbh_cm == pytest.approx(measured(points).dbh_cm, rel=1e-3)
+        np.testing.assert_allclose(moved.position_m[:2], [512_000.0, 5_403_000.0], atol=0.005)
+
+    @example_settings(max_examples=15)
+    @given(st.floats(0.03, 0.6), st.floats(0, 360), st.floats(150, 360), st.integers(0, 999))
+    def test_any_stem_seen_well(self, radius, turn_deg, arc_deg, seed):
+        points = stem(radius, n=2500, arc_deg=arc_deg, noise=0.01 * radius, seed=seed)
+        turn = np.radians(turn_deg)
+        points[:, :2] = points[:, :2] @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        result = measured(points, settings=SMOOTH)
+        assert result.dbh_cm == pytest.approx(200 * radius, rel=0.03)
+        assert result.chosen.low_cm < result.chosen.value_cm < result.chosen.high_cm
+
+
+class TestRefusals:
+    def test_small_arc(self):
+        refusal = estimate_diameter(stem(arc_deg=35, noise=0.012, n=400))
+        assert isinstance(refusal, Refusal)
+        assert not refusal
+        assert refusal.code == "small_arc"
+        assert "°" in refusal.reason
+        assert "other side" in refusal.remedy
+
+    def test_nothing_round(self):
+        rng = np.random.default_rng(0)
+        wall = np.column_stack([rng.uniform(-0.6, 0.6, 400), rng.normal(0, 0.002, 400), rng.uniform(0.8, 2.0, 400)])
+        assert not estimate_diameter(wall)
+
+    def test_empty_and_not_finite(self):
+        assert estimate_diameter(np.empty((0, 3))).code == "no_points"
+        assert estimate_diameter(np.full((50, 3), np.nan)).code == "no_points"
+        points = stem()
+        spoilt = np.concatenate([points, np.full((10, 3), np.inf)])
+        assert measured(spoilt).diameters == measured(points).diameters
+
+    def test_too_few(self):
+        refusal = estimate_diameter(stem(n=400)[:20])
+        assert refusal.code == "too_few_points"
+        assert "25" in refusal.reason
+
+    def test_seen_only_above(self):
+        refusal = estimate_diameter(stem() + [0, 0, 5.0])
+        assert refusal.code == "no_band"
+        assert "5.5" in refusal.reason
+
+    def test_odd_size(self):
+        refusal = estimate_diameter(stem(0.2), settings=EstimatorSettings(max_diameter_cm=80.0, min_diameter_cm=50.0))
+        assert refusal.code == "implausible"
+        assert "scale" in refusal.remedy
+
+    def test_one_spot_many_times(self):
+        assert not estimate_diameter(np.tile([[0.1, 0.2, 1.3]], (100, 1)))
+
+    @pytest.mark.parametrize("shape", [(5,), (5, 2), (0, 4)])
+    def test_wrong_shape(self, shape):
+        with pytest.raises(ValueError, match="points_m"):
+            estimate_diameter(np.zeros(shape))
+
+    @pytest.mark.parametrize("name", ["scale_sd", "drift_m"])
+    @pytest.mark.parametrize("value", [-0.1, np.nan, np.inf])
+    def test_wrong_error(self, name, value):
+        with pytest.raises(ValueError, match=name):
+            estimate_diameter(stem(), **{name: value})
+
+    def test_limits_must_ascend(self):
+        with pytest.raises(SettingError, match="less than"):
+            EstimatorSettings().changed(min_diameter_cm=90.0, max_diameter_cm=50.0)
+
+
+class TestCircle:
+    @pytest.mark.parametrize("axis", ["stem", "vertical"])
+    def test_plain_circle(self, axis):
+        result = measured(stem(), settings=SMOOTH.changed(method="circle", axis=axis))
+        assert result.method == "circle"
+        assert result.dbh_cm == pytest.approx(40.0, rel=0.005)
+        assert result.diameters["tape"].value_cm == result.diameters["area"].value_cm
+        assert np.ptp(np.hypot(*result.outline_uv_m.T)) < 1e-12
+
+    def test_upright_axis_does_not_lean(self):
+        assert measured(stem(lean_deg=10), settings=SMOOTH.changed(method="circle", axis="vertical")).lean_deg == 0.0
+
+
+class TestInterval:
+    spread = Spread(
+        posterior=0.01, sigma_m=0.01, scatter_m=0.003, gap=0.5, bloat_m=0.002, walls_m=0.01, waves=0.02, diameter_m=0.4
+    )
+
+    def test_by_hand(self):
+        calibration = Calibration((0.003, 0.004, 1.0, 0.4, 2.0, 4.0, 0.08, 1.0, 0.5, 0.25), 2.0)
+        terms = [0.003, 0.01, 0.01, 0.01, 0.015, 0.025, 0.08, 0.005, 0.0125, 0.005]
+        assert calibration.log_sd(self.spread) == pytest.approx(np.sqrt(np.sum(np.square(terms))), rel=1e-12)
+
+    @pytest.mark.parametrize("method", CALIBRATIONS)
+    def test_scale_is_added_in_quadrature(self, method):
+        calibration = CALIBRATIONS[method]
+        assert calibration.log_sd(self.spread, scale_sd=0.03) == pytest.approx(
+            np.hypot(calibration.log_sd(self.spread), 0.03), rel=1e-12
+        )
+
+    def test_scale_widens_the_result(self):
+        points = stem()
+        known, unsure = measured(points), measured(points, scale_sd=0.05)
+        assert unsure.dbh_cm == known.dbh_cm
+        assert unsure.log_sd == pytest.approx(np.hypot(known.log_sd, 0.05), rel=1e-9)
+        assert unsure.chosen.half_width > 0.08
+        drifting = measured(points, drift_m=0.02)
+        assert drifting.log_sd == pytest.approx(np.hypot(known.log_sd, 0.02 / known.spread.diameter_m), rel=1e-9)
+
+    def test_holds_the_truth_of_most_irregular_stems(self):
+        held, n = 0, 40
+        for seed in range(n):
+            rng = np.random.default_rng(seed)
+            waves = [(k, 0.03 * (2 / k) ** 1.5 * rng.standard_normal(), rng.uniform(0, 6)) for k in (2, 3, 4)]
+            points = stem(0.18, n=1500, arc_deg=rng.uniform(150, 330), noise=0.008, waves=waves, seed=seed)
+            t = np.linspace(0, 2 * np.pi, 2001)
+            r = 0.18 * (1 + sum(size * np.cos(k * t - phase) for k, size, phase in waves))
+            perimeter = np.hypot(np.diff(r * np.cos(t)), np.diff(r * np.sin(t))).sum()
+            held += measured(points, settings=SMOOTH).diameters["curve"].holds(100 * perimeter / np.pi)
+        assert held >= 0.8 * n
+
+
+class TestParts:
+    def test_waves_are_cosines_of_multiples(self):
+        t = np.linspace(-3, 3, 50)
+        basis = wave_basis(np.cos(t), np.sin(t), 5)
+        expected = [f(k * t) for k in (2, 3, 4, 5) for f in (np.cos, np.sin)]
+        np.testing.assert_allclose(basis, expected, atol=1e-12)
+        assert wave_basis(np.cos(t), np.sin(t), 1).shape == (0, 50)
+
+    def test_frame_is_right_handed_and_polar_inverts(self):
+        tube = Tube(np.array([0.1, -0.2]), np.array([0.2, -0.1]), 0.3, 0.01, np.zeros(2), 0.01)
+        u, v, w = tube.frame()
+        np.testing.assert_allclose(np.cross(u, v), w, atol=1e-12)
+        points = np.random.default_rng(0).normal(size=(20, 3))
+        at = tube.polar(points)
+        local = np.stack([at.cos * at.distance, at.sin * at.distance, at.along])
+        back = np.array([0.1, -0.2, 0.0]) + local.T @ [u, v, w]
+        np.testing.assert_allclose(back, points, atol=1e-8)
+
+    def test_cells_are_numbered_without_gaps(self):
+        rng = np.random.default_rng(0)
+        cell, n_cells = cells_of(rng.uniform(-np.pi, np.pi, 500), rng.uniform(-0.5, 0.7, 500), 0.2, 500)
+        assert set(cell) == set(range(n_cells))
+
+    def test_tukey(self):
+        np.testing.assert_allclose(tukey(np.array([0.0, 1.0, 2.0, 3.0]), 2.0), [1.0, 0.5625, 0.0, 0.0])
+
+    def test_sample_does_not_know_the_order(self):
+        points = np.random.default_rng(0).normal(size=(3000, 3))
+        turned = points[::-1]
+        first, second = sample_points(points, 500, seed=3), sample_points(turned, 500, seed=3)
+        np.testing.assert_array_equal(points[first], turned[second])
+        assert len(set(first)) == 500
+        assert set(first) != set(sample_points(points, 500, seed=4))
+
+    def test_sample_is_fair(self):
+        points = np.random.default_rng(0).uniform(size=(40_000, 3))
+        chosen = points[sample_points(points, 4000, seed=0)]
+        for column in range(3):  # a tenth of all, in each tenth
+            count = np.histogram(chosen[:, column], 10, (0, 1))[0]
+            np.testing.assert_allclose(count, 400, atol=80)
+
+    def test_shift_of_symmetric_and_of_smeared_noise(self):
+        rng = np.random.default_rng(0)
+        even = 0.01 * rng.standard_t(4, 2000)
+        assert abs(surface_shift(even, 0.011, chance=0.1)[0]) < 0.001
+        smeared = 0.005 * rng.standard_normal(3000) + rng.exponential(0.02, 3000) - 0.010
+        shift, sd = surface_shift(smeared, 0.008, chance=0.1)
+        assert shift == pytest.approx(-0.010, abs=0.003)
+        assert 0 < sd < 0.006
+        assert surface_shift(smeared, 0.008, chance=0.0) == (0.0, 0.0)
