@@ -26,12 +26,13 @@ from dbh_studio.core.arrays import Float32
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import Trunk, TrunkSet
-from dbh_studio.errors import ProjectError, ProjectExistsError
+from dbh_studio.errors import CommandError, ProjectError, ProjectExistsError
 from dbh_studio.io.inventory_csv import check_absent, check_not_source, check_replaceable, write_inventory_csv
 from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
 from dbh_studio.settings import GroundSettings, MeasureSettings, Settings
 
 if TYPE_CHECKING:
+    from dbh_studio.app.brought_masks import MaskRequest, MaskSet
     from dbh_studio.app.photo_scale import PhotoRequest
     from dbh_studio.core.ground import GroundModel
     from dbh_studio.core.reconstruction import Reconstruction
@@ -79,6 +80,8 @@ def segment_plot(
     settings: Settings,
     existing_ids: NDArray[Any] | None = None,
     *,
+    candidates: NDArray[np.bool_] | None = None,
+    ground: GroundModel | None = None,
     progress: Progress = ignore_progress,
 ) -> SegmentationResult:
     """Find the ground and the trunks. Pure and picklable, for a job.
@@ -87,6 +90,9 @@ def segment_plot(
         points_world: (N, 3) points, metres, +z up.
         settings: Of the ground and the trunks.
         existing_ids: (N,) tree ids the cloud carries, or None. Trees with too few points to be measured are left out.
+        candidates: (N,) points that masks of photos call trunk; they go before ids. None finds stems by their shape.
+        ground: Where it is known already.
+        progress: Called in between.
 
     Returns:
         The ground, the trunks and notes in plain words. Trunks that were found are numbered from west to east; those
@@ -94,10 +100,11 @@ def segment_plot(
     """
     from dbh_studio.core.ground import fit_ground
 
-    ground = fit_ground(points_world, settings=settings.ground, progress=subprogress(progress, 0.0, 0.4))
+    if ground is None:
+        ground = fit_ground(points_world, settings=settings.ground, progress=subprogress(progress, 0.0, 0.4))
     notes = list(ground.notes)
     trunks = TrunkSet()
-    if existing_ids is not None and settings.trunks.use_existing_ids:
+    if candidates is None and existing_ids is not None and settings.trunks.use_existing_ids:
         trunks, remarks = _trunks_from_ids(existing_ids, settings.measure.min_points)
         notes += remarks
     if not len(trunks):
@@ -107,6 +114,7 @@ def segment_plot(
             points_world,
             ground,
             settings=settings.trunks,
+            candidates=candidates,
             progress=subprogress(progress, 0.4, 1.0),
             seed=settings.measure.seed,
         )
@@ -263,6 +271,7 @@ def run_plot(
     up: str | Direction | None = None,
     settings: Settings | Mapping[str, Mapping[str, Any]] | None = None,
     photos: PhotoRequest | None = None,
+    masks: MaskRequest | None = None,
     plot_id: str = "",
     relocate: Path | str | None = None,
     overwrite: bool = False,
@@ -277,6 +286,7 @@ def run_plot(
         settings: Instead of the defaults, or of those the saved plot has; as section -> name -> value, only the named
             ones are changed.
         photos: Take the scale from markers in these photos.
+        masks: Find the trunks by these masks of the photos. Those a saved plot has are replaced, if `overwrite` allows.
         plot_id: What to call the plot; the file's name by default.
         relocate: Where the cloud of a saved plot is now.
         overwrite: Replace a plot that an earlier run left in `out_dir`, and ``NAME.csv``. Edits made in them are lost.
@@ -303,7 +313,7 @@ def run_plot(
     _check_writable(out_dir)
     timings_s: dict[str, float] = {}
     # Both cores from the beginning: the trunks are looked for while the data are still being looked at.
-    ahead = CallAhead() if in_process and not (is_saved or photos or settings) else None
+    ahead = CallAhead() if in_process and not (is_saved or photos or settings or masks) else None
     with _timed(timings_s, "read"), ahead or nullcontext():
         part = subprogress(progress, 0.0, 0.3)
         read = read_cloud if ahead is None else partial(_read_and_begin, ahead)
@@ -315,11 +325,23 @@ def run_plot(
         check_not_source(csv_path, session.document.source.used)
         _configure(session, settings, plot_id)
         notes = [*session.notes]
+        mask_set = None
+        if masks is not None:
+            # Before the markers are looked for, which takes minutes: a wrong path is told at once.
+            if photos is None:
+                session.require_scale()
+            with _timed(timings_s, "look at the masks"):
+                mask_set = _masks(session, masks, overwrite=overwrite, progress=progress)
+                notes += mask_set.notes
         if photos is not None:
             with _timed(timings_s, "scale"):
                 notes += _scaled(session, photos, in_process=in_process, progress=progress)
         session.require_scale()
-        if not len(session.document.trunks):
+        if masks is not None and mask_set is not None:
+            with _timed(timings_s, "ground, votes and trunks"):
+                part = subprogress(progress, 0.3, 0.7)
+                notes += _by_masks(session, mask_set, masks, in_process=in_process, progress=part)
+        elif not len(session.document.trunks):
             with _timed(timings_s, "ground and trunks"):
                 part = subprogress(progress, 0.3, 0.7)
                 notes += segment(session, progress=part, in_process=in_process, ahead=ahead)
@@ -350,6 +372,26 @@ def _scaled(session: Session, photos: PhotoRequest, *, in_process: bool, progres
 
     verdict = scale_by_photos(session, photos, in_process=in_process, progress=progress).report.verdict
     return [f"{verdict.message} {verdict.remedy}".strip()]
+
+
+def _masks(session: Session, request: MaskRequest, *, overwrite: bool, progress: Progress) -> MaskSet:
+    from dbh_studio.app.image_trunks import masks_of_plot
+
+    if len(session.document.trunks) and not overwrite:
+        raise CommandError(
+            f"The saved plot has {len(session.document.trunks)} trunks already, perhaps with edits.",
+            "Measure it without masks, or say that its trunks may be replaced (--overwrite).",
+        )
+    return masks_of_plot(session, request, progress=subprogress(progress, 0.3, 0.3))
+
+
+def _by_masks(
+    session: Session, masks: MaskSet, request: MaskRequest, *, in_process: bool, progress: Progress
+) -> tuple[str, ...]:
+    """Find the trunks by masks; what the person should know of it."""
+    from dbh_studio.app.image_trunks import trunks_from_masks
+
+    return trunks_from_masks(session, masks, request.votes, in_process=in_process, progress=progress).notes
 
 
 def _read_and_begin(ahead: CallAhead, path: Path, *, progress: Progress = ignore_progress) -> Reconstruction:

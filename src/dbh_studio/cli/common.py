@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 from dbh_studio.errors import SettingError, UnscaledCloudError
 
 if TYPE_CHECKING:
+    from dbh_studio.app.brought_masks import MaskRequest
     from dbh_studio.app.photo_scale import PhotoRequest
 
-_LARGEST_SIDE_M = 10.0
+_SMALLEST_SIDE_M, _LARGEST_SIDE_M = 0.02, 10.0
 UP_AXES = ("+z", "-z", "+y", "-y", "+x", "-x")
 
 
@@ -93,13 +94,108 @@ def add_photo_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_mask_options(parser: argparse.ArgumentParser) -> None:
+    """Options that find trunks by masks of the photos."""
+    masks = parser.add_argument_group(
+        "trunks from masks of the photos", "The photos are those of --cameras and --images, above."
+    )
+    masks.add_argument(
+        "--masks",
+        type=path_argument,
+        metavar="PATH",
+        help="folder with a mask for each photo, named after it, or a COCO file (.json); markers are then looked for "
+        "only where --marker-side, --marker or --dictionary is given",
+    )
+    masks.add_argument(
+        "--mask-meaning",
+        choices=("trunk-bright", "trunk-dark", "ignore-dark", "ignore-bright", "labels"),
+        help="what the masks show; labels: a number for each trunk or class; guessed, and told, where it is clear",
+    )
+    masks.add_argument(
+        "--mask-category",
+        action="append",
+        default=[],
+        dest="mask_categories",
+        metavar="NAME",
+        help="what is trunk: a category of the COCO file, or numbers of the masks such as 7 or 1-12; may be given "
+        "several times",
+    )
+    masks.add_argument(
+        "--mask-style",
+        metavar="STYLE",
+        help="how masks are named: colmap (photo.jpg.png), suffix (photo_mask.png), dotted (photo.mask.png), trunk "
+        "(photo_trunk.png), same (photo.png), or a template such as {stem}_segm.png; by default what fits most photos",
+    )
+    masks.add_argument(
+        "--ignore-masks",
+        type=path_argument,
+        metavar="PATH",
+        help="more masks, one for each photo or one picture for all: where they are dark, the photos say nothing",
+    )
+    masks.add_argument(
+        "--ignore-side", choices=("dark", "bright"), help="which side of --ignore-masks is ignored; dark by default"
+    )
+    masks.add_argument(
+        "--mask-overlay",
+        type=path_argument,
+        metavar="FILE.jpg",
+        help="write one photo with its mask drawn, to see whether the masks are read as they are meant",
+    )
+    masks.add_argument(
+        "--paper-votes",
+        action="store_true",
+        help="a point is trunk where one mask says so, also behind others, as in the paper; by default hidden points "
+        "do not vote and masks must agree",
+    )
+
+
+def mask_request(options: argparse.Namespace) -> MaskRequest | None:
+    """What the mask options ask for; None where none is given.
+
+    Raises:
+        SettingError: Options about masks, and no masks.
+    """
+    if options.masks is None:
+        about = {
+            "--mask-meaning": options.mask_meaning,
+            "--mask-category": options.mask_categories,
+            "--mask-style": options.mask_style,
+            "--ignore-masks": options.ignore_masks,
+            "--ignore-side": options.ignore_side,
+            "--mask-overlay": options.mask_overlay,
+            "--paper-votes": options.paper_votes,
+        }
+        given = [name for name, value in about.items() if value]
+        if given:
+            raise SettingError(f"{given[0]} was given without masks.", "Say where the masks are: --masks PATH.")
+        return None
+    from dbh_studio.app.brought_masks import MaskRequest
+    from dbh_studio.settings import VoteSettings
+
+    return MaskRequest(
+        options.masks,
+        options.mask_meaning and options.mask_meaning.replace("-", "_"),
+        options.mask_style,
+        tuple(options.mask_categories),
+        VoteSettings.paper() if options.paper_votes else VoteSettings(),
+        ignore_path=options.ignore_masks,
+        ignore_side=options.ignore_side or "dark",
+        cameras=options.cameras,
+        images_dir=options.images,
+        overlay=options.mask_overlay,
+    )
+
+
 def photo_request(options: argparse.Namespace) -> PhotoRequest | None:
     """What the photo options ask for; None where none is given.
 
     Raises:
         SettingError: A side or a dictionary cannot be.
     """
-    given = (options.cameras, options.images, options.marker_side, *options.markers, *options.dictionaries)
+    given = (options.marker_side, *options.markers, *options.dictionaries)
+    if getattr(options, "masks", None) is None:
+        # Photos that are there for masks need not show markers.
+        given = (options.cameras, options.images, *given)
     if all(value is None for value in given):
         return None
     from dbh_studio.app.photo_scale import PhotoRequest
@@ -120,7 +216,7 @@ def _marker_side(text: str) -> tuple[str, float]:
     dictionary, _, number = name.rpartition(":")
     try:
         side_m = float(value)
-        if not number.strip().isdigit() or not 0.0 < side_m <= _LARGEST_SIDE_M:
+        if not number.strip().isdigit() or not _SMALLEST_SIDE_M <= side_m <= _LARGEST_SIDE_M:
             raise ValueError
     except ValueError:
         raise SettingError(
@@ -229,13 +325,14 @@ def _check_name(section: str, name: str) -> None:
         raise SettingError(f"There is no setting {section}.{name}.", f"{meant}`dbh-studio settings` lists them.")
 
 
-def unscaled_error() -> UnscaledCloudError:
-    """What a person at the command line can do about a cloud without a scale."""
+def unscaled_error(*, has_photos: bool = False) -> UnscaledCloudError:
+    """What a person at the command line can do about a cloud without a scale, and with photos given for masks."""
+    markers = " If the photos show a marker, add --marker-side, its side in metres." if has_photos else ""
     return UnscaledCloudError(
         "The file does not tell how long its unit is, so no diameter can be given.",
         "Say it: --scale metres (or feet, us-feet, centimetres, millimetres), or metres per unit such as "
         "--scale 1.332. A cloud from photographs has a scale of its own: measure it by markers or a known distance, "
-        "with `dbh-studio scale` or in the studio (`dbh-studio open`) under Scale.",
+        f"with `dbh-studio scale` or in the studio (`dbh-studio open`) under Scale.{markers}",
     )
 
 

@@ -10,10 +10,12 @@ from typing import Any
 
 from dbh_studio.cli.common import (
     add_cloud_options,
+    add_mask_options,
     add_photo_options,
     add_relocation_option,
     add_settings_options,
     counted,
+    mask_request,
     path_argument,
     photo_request,
     plain,
@@ -44,6 +46,7 @@ def add_commands(commands: Any) -> None:
     add_relocation_option(run)
     add_settings_options(run)
     add_photo_options(run)
+    add_mask_options(run)
     run.add_argument("--name", default="", help="what to call the plot; the file's name by default")
     run.add_argument(
         "--overwrite",
@@ -60,7 +63,7 @@ def run_plot(options: argparse.Namespace) -> int:
     from dbh_studio.app import pipeline
 
     changes = settings_changes(options)
-    photos = photo_request(options)
+    photos, masks = photo_request(options), mask_request(options)
     if photos is not None and options.scale is not None:
         raise SettingError("Both --scale and markers in photos were given.", "Leave one of them away.")
     try:
@@ -72,13 +75,14 @@ def run_plot(options: argparse.Namespace) -> int:
                 up=options.up,
                 settings=changes,
                 photos=photos,
+                masks=masks,
                 plot_id=options.name,
                 relocate=options.cloud,
                 overwrite=options.overwrite,
                 progress=progress,
             )
     except UnscaledCloudError:
-        raise unscaled_error() from None
+        raise unscaled_error(has_photos=masks is not None) from None
     except ProjectExistsError as error:
         remedy = "Give `run` that plot itself to measure it again, choose another --out or --name, or add --overwrite."
         raise ProjectExistsError(error.problem, remedy) from None
