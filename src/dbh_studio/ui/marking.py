@@ -55,6 +55,7 @@ class Marking:
         self._is_drawn_on = False
         self._banner = ""
         tab.bridge.on("mark", self._asked)
+        tab.bridge.run(marking_html.keys_js())
 
     # ---- beginning and ending
 

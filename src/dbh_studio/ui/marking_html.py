@@ -200,6 +200,32 @@ def _offers(picks: PointPicks, offered: Sequence[Suggestion], scale: ScaleEstima
     return f'{onward}<div class="dbh-offers"><span class="muted">It should also be in sight in:</span>{buttons}</div>'
 
 
+def keys_js() -> str:
+    """Lets the arrow keys move the enlarged point once it was clicked, until something else is.
+
+    On the window and not on the picture: each move draws the picture anew, and the new one has no focus.
+    """
+    return f"""
+    if (!window.dbhCloseUpKeys) {{
+      window.dbhCloseUpKeys = true;
+      let meant = false;
+      window.addEventListener('pointerdown', (e) => {{
+        meant = e.target instanceof Element && !!e.target.closest('.dbh-closeup');
+      }}, true);
+      window.addEventListener('keydown', (e) => {{
+        const picture = document.querySelector('.dbh-closeup');
+        if (!picture || !(meant || document.activeElement === picture)) return;
+        const s = e.shiftKey ? 5 : 1;
+        const k = {{ArrowLeft: [-s, 0], ArrowRight: [s, 0], ArrowUp: [0, -s], ArrowDown: [0, s]}}[e.key];
+        if (!k) return;
+        e.preventDefault();
+        e.stopPropagation();
+        dbh({js("mark")}, [{js("nudge")}, k]);
+      }}, true);
+    }}
+    """
+
+
 def close_up_picture(close_up: CloseUp, cross: tuple[float, float], scale: ScaleEstimate) -> str:
     """The surroundings of a point, enlarged, with the point and a length to go by."""
     x, y = (CLOSE_UP_PX * value for value in cross)
@@ -210,10 +236,6 @@ def close_up_picture(close_up: CloseUp, cross: tuple[float, float], scale: Scale
     at = esc(
         f"const r=this.getBoundingClientRect();this.focus();dbh({js('mark')},[{js('at')},"
         "[(event.clientX-r.left)/r.width,(event.clientY-r.top)/r.height]])"
-    )
-    keys = esc(
-        "const s=event.shiftKey?5:1,k={ArrowLeft:[-s,0],ArrowRight:[s,0],ArrowUp:[0,-s],ArrowDown:[0,s]}[event.key];"
-        f"if(k){{event.preventDefault();event.stopPropagation();dbh({js('mark')},[{js('nudge')},k])}}"
     )
     svg = (
         f'<svg viewBox="0 0 {CLOSE_UP_PX} {CLOSE_UP_PX}">'
@@ -226,7 +248,7 @@ def close_up_picture(close_up: CloseUp, cross: tuple[float, float], scale: Scale
     )
     return (
         '<div class="dbh-zoomed"><div class="dbh-closeup" tabindex="0" role="application" '
-        f'aria-label="The point, enlarged" onclick="{at}" onkeydown="{keys}">'
+        f'aria-label="The point, enlarged" onclick="{at}">'
         f'<img alt="" draggable="false" src="{_png_url(close_up.picture(CLOSE_UP_PX))}">{svg}</div>'
         f'<div class="dbh-zoombar">{_button("zoom", 1, "+")}{_button("zoom", -1, "&#8722;")}'
         '<span class="muted">Click here to move the point. Arrow keys: finer.</span></div></div>'
