@@ -308,6 +308,7 @@ def test_marks_are_drawn_into_the_photos(tab, studio, session):
     corners, names = truth.corners(), [photo.name for photo in truth.posed]
     session.do(commands.add_length(bar()))
     tab.bridge_send("mark", ["start", ["bar", "photos"]])
+    tab.wait(lambda _: marking.picks is not None)
     worker.post(marking.photo_clicked, *sight(names[0], corners[0]))
     tab.wait(lambda _: marking.picks is not None and marking.picks.current.rough_src is not None)
     kinds = [(mark.kind, mark.label) for mark in marking._marks_of(names[0])]
@@ -407,8 +408,9 @@ def test_the_field_of_the_side_follows_what_the_markers_have(tab, session):
     tab.wait_text("Known lengths")
     tab.bridge_send("marker-side", "50 cm")
     tab.wait(lambda _: {square.side_m for square in session.document.evidence.squares} == {0.5})
-    tab.bridge_send("undo")
     field = re.compile(r'value="([0-9.]+)"[^>]*data-field="marker-side"')
+    tab.wait(lambda t: field.findall(t.html()) == ["0.50"])
+    tab.bridge_send("undo")
     tab.wait(lambda t: field.findall(t.html()) == ["1.00"])
     tab.bridge_send("marker-side", "0.8")
     tab.wait(lambda _: {square.side_m for square in session.document.evidence.squares} == {0.8})
