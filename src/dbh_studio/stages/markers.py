@@ -191,9 +191,7 @@ def measure_scale(
     return scale_from_detections(detections, posed, sides_m, settings=settings, left_out=left_out)
 
 
-def why_none(
-    posed: PosedImages, settings: MarkerSettings, read_image: ReadImage, progress: Progress
-) -> Refusal | None:
+def why_none(posed: PosedImages, settings: MarkerSettings, read_image: ReadImage, progress: Progress) -> Refusal | None:
     """What a few photos show where the search found nothing; None where they show nothing of the kind either."""
     everything = Detector(all_dictionaries())
     photos = list(posed.images)
