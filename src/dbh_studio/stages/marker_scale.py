@@ -10,12 +10,12 @@ from dbh_studio.core.arrays import Float64
 from dbh_studio.core.bars import BarResidual, ScaleReport, refused_scale
 from dbh_studio.core.dbh import Refusal
 from dbh_studio.core.scale import CombinedScale, MeasuredLength, ScaleEstimate, ScaleVerdict, combine_lengths
+from dbh_studio.core.scale_evidence import WELL_SEEN
 from dbh_studio.settings import MarkerSettings
 from dbh_studio.stages.marker_geometry import Marker3D, MarkerKey
 
 # Sides and diagonals of a flat square agree better than this: to 0.35 % on sixty rendered plots.
 _BENT_SHARE = 0.006
-_WELL_SEEN = 4
 # Nobody prints markers outside this.
 _SMALLEST_SIDE_M, _LARGEST_SIDE_M = 0.02, 10.0
 # Markers that differ by more are not of the sizes given; by more than the second, no mean of them means anything.
@@ -232,9 +232,9 @@ def _contradiction(markers: Sequence[Marker3D], sides: Mapping[MarkerKey, float]
 
 def _trusted(markers: Sequence[Marker3D], named: Mapping[MarkerKey, float]) -> list[Marker3D]:
     """Without codes that nobody named and few photos show, where others are seen well: such may be no markers."""
-    if not any(len(marker.views_used) >= _WELL_SEEN for marker in markers):
+    if not any(len(marker.views_used) >= WELL_SEEN for marker in markers):
         return list(markers)
-    return [marker for marker in markers if marker.key in named or len(marker.views_used) >= _WELL_SEEN]
+    return [marker for marker in markers if marker.key in named or len(marker.views_used) >= WELL_SEEN]
 
 
 def _length(marker: Marker3D, side_m: float, settings: MarkerSettings) -> MeasuredLength:
@@ -298,7 +298,7 @@ def _verdict(
     if problems:
         intro = "But" if problems[0].code == "default_side" else "Not used:"
         return ScaleVerdict("caution", problems[0].code, f"{said}. {intro} {problems[0].reason}", problems[0].remedy)
-    if n_views < _WELL_SEEN:
+    if n_views < WELL_SEEN:
         return ScaleVerdict(
             "caution", "few_views", f"{said}, seen in {n_views} photos only.", "Take more photos of it, from all sides."
         )
