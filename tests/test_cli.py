@@ -486,8 +486,10 @@ def the_full_device_is_full() -> bool:
 
 
 @pytest.mark.skipif(not the_full_device_is_full(), reason="there is no device that is always full")
-def test_output_to_a_full_disk():
-    with open("/dev/full", "w") as full, start(["--help"], stdout=full) as process:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_to_a_full_disk(unbuffered, monkeypatch):
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    with open("/dev/full", "w") as full, start(["settings"], stdout=full) as process:
         assert "No space left" in process.stderr.read() and process.wait(timeout=60) == 1
 
 
