@@ -45,7 +45,7 @@ from dbh_studio.ui.studio import Studio  # noqa: E402
 CLICK_S, COLOURS_S = 0.3, 0.2
 LONG_S = 300.0
 # The studio begins with red trunks: every step is a change.
-_MODES = [*COLOUR_MODES[2:], *COLOUR_MODES[:2]] * 3
+_MODES = [*COLOUR_MODES[2:], *COLOUR_MODES[:2]] * 6
 _NO_DRAWING = """
 const draw = WebGL2RenderingContext.prototype.drawArrays;
 WebGL2RenderingContext.prototype.drawArrays = function (mode, first, count) {

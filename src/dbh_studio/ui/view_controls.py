@@ -56,6 +56,7 @@ class ViewControls:
         self._tab.view.mode = mode
         self._tab.scene.set_mode(mode)
         self._show_bar()
+        self._tab.client.flush()  # not with the next heap: somebody waits for it
 
     def next_mode(self) -> None:
         """The colours after those on screen, round and round."""
