@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 from tests.app.plots import make_cloud, make_document
 
-from dbh_studio.app import scaling
+from dbh_studio.app import found_markers
 from dbh_studio.app.commands import add_length, change_length
+from dbh_studio.app.found_markers import change_side, strike_out, use_marker
 from dbh_studio.app.lengths import metres_from_text
-from dbh_studio.app.scaling import (
-    change_side,
-    frame_from_square,
-    photos_of_point,
-    point_from_sights,
-    scale_from_baseline,
-    scale_from_camera_height,
-    scale_from_evidence,
-    strike_out,
-    use_marker,
-)
+from dbh_studio.app.photo_points import photos_of_point, point_from_sights
+from dbh_studio.app.scaling import frame_from_square, scale_from_baseline, scale_from_camera_height, scale_from_evidence
 from dbh_studio.core.bars import refused_scale
 from dbh_studio.core.camera import CameraModel
 from dbh_studio.core.cloud import PointCloud
@@ -159,12 +151,12 @@ def test_the_scale_is_taken_from_the_control_lengths():
 def search_result(*squares):
     evidence = ScaleEvidence((), squares)
     report = evidence.report() if squares else refused_scale("no_marker", "No marker was found.", "Look again.")
-    return scaling.MarkerSearch((), squares, report, ())
+    return found_markers.MarkerSearch((), squares, report, ())
 
 
 def test_a_search_sets_markers_and_scale_in_one_step():
     document = add_length(bar(name="by hand", role="check")).apply(make_document(make_cloud(), scale=ScaleEstimate()))
-    after = scaling.apply_search(document, search_result(square())).apply(document)
+    after = found_markers.apply_search(document, search_result(square())).apply(document)
     assert after.scale.metres_per_unit == pytest.approx(0.5) and after.scale.source == "marker"
     assert {each.name for each in after.evidence} == {"DICT_4X4_50 7", "by hand"}
 
@@ -172,7 +164,7 @@ def test_a_search_sets_markers_and_scale_in_one_step():
 def test_a_search_without_a_marker_says_so_and_changes_nothing():
     document = make_document(make_cloud())
     with pytest.raises(CommandError, match="No marker was found"):
-        scaling.apply_search(document, search_result())
+        found_markers.apply_search(document, search_result())
 
 
 def test_the_side_of_all_markers_changes_in_one_step():
@@ -196,7 +188,7 @@ def placed(monkeypatch):
         squares = {0: (square(),), 1: (square(side_src=2.2),)}.get(len(left_out), ())
         return search_result(*(replace(each, side_m=(sides_m or {}).get(KEY, 1.0)) for each in squares))
 
-    monkeypatch.setattr(scaling, "place_markers", place)
+    monkeypatch.setattr(found_markers, "place_markers", place)
     return [SimpleNamespace(image=name) for name in ("a.jpg", "b.jpg")]
 
 
@@ -254,7 +246,7 @@ def test_the_side_of_a_marker_counts_by_whatever_name_of_its_dictionary():
     posed = walk()
     finds = finds_of(KEY, 1.0, 0.0, posed)
     for name in ("DICT_4X4_50", "DICT_4X4_250", "4x4_1000"):
-        search = scaling.place_markers(finds, posed, {(name, KEY[1]): 0.5})
+        search = found_markers.place_markers(finds, posed, {(name, KEY[1]): 0.5})
         assert search.report.estimate.metres_per_unit == pytest.approx(0.5, rel=1e-3), name
         assert search.squares[0].side_m == 0.5
 
@@ -265,9 +257,9 @@ def test_turned_photos_are_told_from_a_marker_that_was_seen_once():
     for number, find in enumerate(finds_of(KEY, 1.0, 0.0, posed)):
         turned = find.corners_px + [PANORAMA.width_px * (number % 4) / 4, 0.0]
         finds.append(replace(find, corners_px=turned % PANORAMA.width_px))
-    search = scaling.place_markers(finds, posed)
+    search = found_markers.place_markers(finds, posed)
     assert search.report.verdict.code == "poses_disagree"
-    assert scaling.place_markers(finds[:1], posed).report.verdict.code == "one_view"
+    assert found_markers.place_markers(finds[:1], posed).report.verdict.code == "one_view"
 
 
 def test_a_marker_of_another_size_is_kept_as_a_check_that_fails_until_its_side_is_right():
@@ -275,7 +267,7 @@ def test_a_marker_of_another_size_is_kept_as_a_check_that_fails_until_its_side_i
     finds = [f for key, side, x in ((KEY, 1.0, -1.0), (THIRD, 1.0, 1.0), (OTHER, 0.5, 0.0))
              for f in finds_of(key, side, x, posed)]  # fmt: skip
     start = make_document(make_cloud(), scale=ScaleEstimate())
-    after = scaling.apply_search(start, scaling.place_markers(finds, posed)).apply(start)
+    after = found_markers.apply_search(start, found_markers.place_markers(finds, posed)).apply(start)
     assert after.scale.metres_per_unit == pytest.approx(1.0, rel=1e-3)
     assert [(s.marker[1], s.role) for s in after.evidence.squares] == [(7, "control"), (13, "check"), (21, "control")]
     verdict = after.evidence.report().verdict
@@ -292,10 +284,10 @@ def test_two_sizes_and_no_side_named_give_no_scale_until_a_person_names_one():
     posed = walk()
     finds = finds_of(KEY, 1.0, -1.0, posed) + finds_of(OTHER, 0.5, 1.0, posed)
     start = make_document(make_cloud(), scale=ScaleEstimate())
-    search = scaling.place_markers(finds, posed)
+    search = found_markers.place_markers(finds, posed)
     assert search.report.verdict.code == "contradict" and search.squares == ()
     with pytest.raises(CommandError, match="contradict"):
-        scaling.apply_search(start, search)
+        found_markers.apply_search(start, search)
     after = use_marker(start, finds, posed, OTHER, 0.5).apply(start)
     assert after.scale.metres_per_unit == pytest.approx(1.0, rel=1e-3)
     assert after.evidence.report().verdict.code == "agrees"
@@ -312,12 +304,12 @@ def test_a_find_is_struck_out_with_the_side_of_the_search():
 def test_a_cloud_in_metres_keeps_its_unit_where_that_is_wanted():
     in_metres = make_document(make_cloud(), scale=ScaleEstimate(1.0, "metres"))
     search = search_result(square())
-    kept = scaling.apply_search(in_metres, search, keep_number=True).apply(in_metres)
+    kept = found_markers.apply_search(in_metres, search, keep_number=True).apply(in_metres)
     assert kept.scale == in_metres.scale and len(kept.evidence) == 1
-    asked = scaling.apply_search(in_metres, search).apply(in_metres)
+    asked = found_markers.apply_search(in_metres, search).apply(in_metres)
     assert asked.scale.metres_per_unit == pytest.approx(0.5)
     weak = make_document(make_cloud(), scale=ScaleEstimate(0.7, "baseline", 0.1))
-    assert scaling.apply_search(weak, search, keep_number=True).apply(weak).scale.source == "marker"
+    assert found_markers.apply_search(weak, search, keep_number=True).apply(weak).scale.source == "marker"
 
 
 # ---- where nothing else exists

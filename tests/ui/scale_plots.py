@@ -14,8 +14,8 @@ from PIL import Image
 from dbh_studio.app import commands
 from dbh_studio.app.cameras import cloud_sample, read_cameras
 from dbh_studio.app.document import CameraSource
+from dbh_studio.app.found_markers import MarkerSearch, place_markers
 from dbh_studio.app.opening import open_plot
-from dbh_studio.app.scaling import MarkerSearch, place_markers
 from dbh_studio.app.session import Session
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.posed_images import PosedImages

@@ -11,7 +11,7 @@ from panel import LONG
 from scipy.spatial import cKDTree
 
 from dbh_studio.app import commands
-from dbh_studio.app.scaling import apply_search
+from dbh_studio.app.found_markers import apply_search
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.scale_evidence import MarkedPoint, ScaleBar, ScaleEvidence
 from dbh_studio.ui import scale_html

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from dbh_studio.app.cameras import Cameras, cameras_of, cloud_sample, read_cameras, require_fit
 from dbh_studio.app.commands import set_cameras
 from dbh_studio.app.document import CameraSource
+from dbh_studio.app.found_markers import MarkerSearch, apply_search, checks_of, place_markers, search_markers
 from dbh_studio.app.jobs import run_job
-from dbh_studio.app.scaling import MarkerSearch, apply_search, checks_of, place_markers, search_markers
 from dbh_studio.app.session import Session
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale_evidence import MarkerKey

@@ -10,8 +10,7 @@ from dbh_studio.app.autosave import Autosave
 from dbh_studio.app.cameras import require_fit
 from dbh_studio.app.commands import Command
 from dbh_studio.app.document import CameraSource, Document
-from dbh_studio.app.marker_cache import keep_detections, kept_detections
-from dbh_studio.app.scaling import (
+from dbh_studio.app.found_markers import (
     MarkerSearch,
     apply_search,
     checks_of,
@@ -21,6 +20,7 @@ from dbh_studio.app.scaling import (
     strike_out,
     use_marker,
 )
+from dbh_studio.app.marker_cache import keep_detections, kept_detections
 from dbh_studio.errors import StudioError
 from dbh_studio.settings import MarkerSettings
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dbh_studio.app.scaling import Suggestion
+from dbh_studio.app.photo_points import Suggestion
 from dbh_studio.core.arrays import UInt8
 from dbh_studio.core.close_up import CloseUp
 from dbh_studio.core.scale import ScaleEstimate

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from dbh_studio.app.scaling import Suggestion, TriangulatedPoint, photos_of_point, point_from_sights
+from dbh_studio.app.photo_points import Suggestion, TriangulatedPoint, photos_of_point, point_from_sights
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.bars import BarRole
 from dbh_studio.core.dbh import Refusal

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import viser
 
+from dbh_studio.app.found_markers import change_side
 from dbh_studio.app.lengths import metres_from_text
-from dbh_studio.app.scaling import change_side
 from dbh_studio.app.session import Session
 from dbh_studio.core.scale_evidence import MarkerSquare
 from dbh_studio.ui import scale_html
