@@ -76,6 +76,18 @@ fmt: setup-dev ## put the code in the house style
 bench: setup-dev ## measure speed and compare it with the committed baseline
 	$(BIN)/python -m bench $(ARGS)
 
+# Not part of `make test`: torch is never a dependency, and its wheel is larger than all the rest together.
+PARITY_VENV ?= .venv-parity
+
+.PHONY: parity
+parity: $(PARITY_VENV)/.ready ## compare the trained models' runtime with transformers (fetches torch, 3 GB)
+	PYTHONPATH=src:. $(PARITY_VENV)/bin/python -m pytest --noconftest tests/parity/test_transformers_parity.py $(ARGS)
+
+$(PARITY_VENV)/.ready: requirements/parity.txt
+	$(PYTHON) -m venv $(PARITY_VENV)
+	$(PARITY_VENV)/bin/python -m pip install --quiet --requirement $<
+	@touch $@
+
 # The run lock is a part of the dev lock: the same versions are tested and shipped.
 LOCK := pip compile pyproject.toml --universal --python-version 3.10 --generate-hashes --no-emit-index-url \
 	--only-binary :all: --custom-compile-command "make lock" --quiet
@@ -86,5 +98,5 @@ lock: ## resolve the locked requirements again (needs uv and network; ARGS=--upg
 	$(UV) $(LOCK) --group build --constraints requirements/dev.lock --output-file requirements/run.lock
 
 clean: ## remove the environment, the caches and the build products
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(PARITY_VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -not -path './.git/*' -prune -exec rm -rf {} +

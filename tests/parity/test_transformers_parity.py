@@ -1,10 +1,6 @@
 """The runtime (onnxruntime, numpy, Pillow, OpenCV) equals transformers (torch) at every step, on random weights.
 
-Run where torch and transformers are installed, for example in an environment of its own:
-
-    pip install torch transformers onnx onnxruntime opencv-python-headless pillow scipy pydantic pytest hypothesis
-    PYTHONPATH=src:. python -m pytest --noconftest tests/parity/test_transformers_parity.py \
-        -o log_cli=true -o log_cli_level=INFO
+`make parity` runs it, in an environment of its own; `make test` has no torch and skips it.
 
 Measured with torch 2.13.0 (CPU), transformers 5.23.0, tokenizers 0.23.3, onnxruntime 1.31.1, Pillow 13.0.0 and OpenCV
 5.0.0, largest absolute difference (tolerance):
