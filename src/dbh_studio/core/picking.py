@@ -119,6 +119,18 @@ class PickCloud:
         )
         self.spacing = _spacing(self._axes)
 
+    @classmethod
+    def over(cls, xyz: Float32) -> PickCloud:
+        """The same over an (N, 3) array that is not copied: for one selection among all points of a large plot.
+
+        Pieces are brought together as they are looked at, which takes twice as long; the spacing is not known (0).
+        """
+        points = as_points(xyz, name="xyz")
+        cloud = cls.__new__(cls)
+        cloud._axes = tuple(_Column(points, axis) for axis in range(3))  # type: ignore[assignment]
+        cloud.spacing = 0.0
+        return cloud
+
     def __len__(self) -> int:
         return len(self._axes[0])
 
@@ -244,6 +256,32 @@ class PickCloud:
                 screen_y = (y[chosen] / depth[chosen] + 1) / 2
                 found.append(chosen[test(screen_x, screen_y)] + low)
         return np.concatenate(found).astype(np.int64) if found else np.empty(0, np.int64)
+
+    def ball(self, centre: Any, radius: float) -> Int64:
+        """(K,) sorted indices of the points within `radius` of a place, both in the unit of the points."""
+        middle = np.asarray(centre, np.float32).reshape(3)
+        found: list[Int64] = []
+        for low in range(0, len(self), _CHUNK):
+            with np.errstate(invalid="ignore", over="ignore"):  # points that are not finite fail every comparison
+                x, y, z = (axis[low : low + _CHUNK] - c for axis, c in zip(self._axes, middle, strict=True))
+                near = np.flatnonzero((np.abs(x) <= radius) & (np.abs(y) <= radius) & (np.abs(z) <= radius))
+                near = near[x[near] ** 2 + y[near] ** 2 + z[near] ** 2 <= radius * radius]
+            if len(near):
+                found.append(near + low)
+        return np.concatenate(found).astype(np.int64) if found else np.empty(0, np.int64)
+
+
+class _Column:
+    """One coordinate of an (N, 3) array; a piece is copied when it is asked for."""
+
+    def __init__(self, points: Float, axis: int) -> None:
+        self._points, self._axis = points, axis
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def __getitem__(self, piece: slice) -> Float32:
+        return np.ascontiguousarray(self._points[piece, self._axis], np.float32)
 
 
 def plane_through(points: NDArray[np.floating[Any]]) -> tuple[Float64, Float64]:

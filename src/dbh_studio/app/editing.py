@@ -1,0 +1,198 @@
+"""From what a person draws or clicks to points and edits: selections, cuts, growth, and a stem followed from a click.
+
+Selections are taken among all points of the cloud, not among those on screen, and give indices into it. Cuts and growth
+give commands, computed for the plot as it is: send them with ``based_on``, so that a change meanwhile refuses them.
+
+    points = select_lasso(session, view, polygon, within=[7])
+    session.do(drop_points(points, 7))
+    session.do(split_by_line(session, 7, view, (0.4, 0.2), (0.45, 0.9)))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from dbh_studio.app.commands import Command
+from dbh_studio.app.document import Document
+from dbh_studio.app.edits import add_trunk, assign_points, keep_only, split_trunk
+from dbh_studio.app.session import Session
+from dbh_studio.core.arrays import Float32, Int64
+from dbh_studio.core.dbh import Refusal
+from dbh_studio.core.picking import PickCloud, View
+from dbh_studio.core.trunk_edits import beyond_plane, grown, plane_of_line, shrunk
+from dbh_studio.core.trunks import Trunk
+from dbh_studio.errors import CommandError
+
+# What a trunk grows or shrinks by at a press of a key, metres.
+STEP_M = 0.03
+
+
+def select_lasso(session: Session, view: View, polygon_xy: Any, *, within: Iterable[int] | None = None) -> Int64:
+    """(K,) sorted indices of the points that appear inside a polygon drawn on the screen, hidden ones too.
+
+    Args:
+        session: The plot.
+        view: The camera, in the world frame.
+        polygon_xy: (M, 2) screen positions 0..1.
+        within: Only points of these trunks; None takes all.
+    """
+    points, rows = _looked_at(session, within)
+    found = PickCloud.over(points).lasso(view, polygon_xy)
+    return found if rows is None else rows[found]
+
+
+def select_rectangle(
+    session: Session, view: View, lower_xy: Any, upper_xy: Any, *, within: Iterable[int] | None = None
+) -> Int64:
+    """As `select_lasso`, between two corners 0..1."""
+    points, rows = _looked_at(session, within)
+    found = PickCloud.over(points).rectangle(view, lower_xy, upper_xy)
+    return found if rows is None else rows[found]
+
+
+def select_ball(session: Session, centre_world: Any, radius_m: float, *, within: Iterable[int] | None = None) -> Int64:
+    """(K,) sorted indices of the points within `radius_m` of a place: the brush."""
+    if not (np.isfinite(radius_m) and radius_m > 0):
+        raise CommandError("The brush has no size.", "Choose a size above 0.")
+    points, rows = _looked_at(session, within)
+    found = PickCloud.over(points).ball(centre_world, radius_m)
+    return found if rows is None else rows[found]
+
+
+def split_by_line(session: Session, trunk_id: int, view: View, first_xy: Any, last_xy: Any) -> Command:
+    """Cut a trunk in two along a line drawn on the screen.
+
+    Raises:
+        CommandError: There is no such trunk, the line is no line, or it misses the trunk.
+    """
+    try:
+        through, normal = plane_of_line(view, first_xy, last_xy)
+    except ValueError:
+        raise CommandError("The line is too short to cut along.", "Draw it through the whole trunk.") from None
+    return split_by_plane(session, trunk_id, through, normal)
+
+
+def split_by_plane(session: Session, trunk_id: int, through_world: Any, normal_world: Any) -> Command:
+    """Cut a trunk in two along a plane.
+
+    Raises:
+        CommandError: There is no such trunk.
+    """
+    document = session.document
+    trunk = _existing(document, trunk_id)
+    beyond = beyond_plane(session.points_world(document)[trunk.points], through_world, normal_world)
+    return split_trunk(trunk_id, [trunk.points[beyond], trunk.points[~beyond]])
+
+
+def split_by_stems(session: Session, trunk_id: int) -> Command:
+    """Part a trunk into the stems that are seen in it: twins, a fork below breast height, a neighbour.
+
+    Raises:
+        CommandError: Only one stem is seen; says what to do instead.
+        UnscaledCloudError: The scale is not known.
+    """
+    from dbh_studio.stages.stem_edits import part_stems
+
+    document = session.document
+    trunk = _existing(document, trunk_id)
+    session.require_scale(document)
+    labels = part_stems(
+        session.points_world(document)[trunk.points],
+        session.ground(document=document),
+        settings=document.settings.trunks,
+        seed=document.settings.measure.seed,
+    )
+    if isinstance(labels, Refusal):
+        raise CommandError(labels.reason, labels.remedy)
+    return split_trunk(trunk_id, [trunk.points[labels == part] for part in range(int(labels.max()) + 1)])
+
+
+def add_by_click(session: Session, seed_world: Any) -> tuple[Command, str]:
+    """Follow the stem that a click hit and make a trunk of it; points of other trunks are left where they are.
+
+    Returns:
+        The command, and what must be looked at; empty where the stem was sure.
+
+    Raises:
+        CommandError: There is no stem there; says what to do instead.
+        UnscaledCloudError: The scale is not known.
+    """
+    from dbh_studio.stages.stem_edits import grow_stem
+
+    document = session.document
+    session.require_scale(document)
+    stem = grow_stem(
+        session.points_world(document),
+        seed_world,
+        session.ground(document=document),
+        is_free=~_owned(document),
+        settings=document.settings.trunks,
+        seed=document.settings.measure.seed,
+    )
+    if isinstance(stem, Refusal):
+        raise CommandError(stem.reason, stem.remedy)
+    return add_trunk(stem.rows), stem.note
+
+
+def grow_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) -> Command:
+    """Let the free points within a distance of a trunk join it."""
+    document = session.document
+    trunk = _existing(document, trunk_id)
+    points = session.points_world(document)
+    near = _near(points, trunk, distance_m)
+    free = near[~_owned(document)[near]]
+    return assign_points(grown(points, trunk.points, free, distance_m), trunk_id)
+
+
+def shrink_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) -> Command:
+    """Take off a trunk its rim: what is within a distance of points of others, or nearly alone.
+
+    Raises:
+        CommandError: Nothing of it would be left.
+    """
+    document = session.document
+    trunk = _existing(document, trunk_id)
+    points = session.points_world(document)
+    others = np.setdiff1d(_near(points, trunk, distance_m), trunk.points, assume_unique=True)
+    left = shrunk(points, trunk.points, others, distance_m)
+    if len(left) < 3:
+        raise CommandError(f"Nothing of trunk {trunk_id} would be left.", "Shrink it by less, or delete it.")
+    return keep_only(left, trunk_id)
+
+
+def _existing(document: Document, trunk_id: int) -> Trunk:
+    if trunk_id not in document.trunks:
+        raise CommandError(f"There is no trunk {trunk_id}.", "It may have been merged or deleted: see Undo.")
+    return document.trunks[trunk_id]
+
+
+def _looked_at(session: Session, within: Iterable[int] | None) -> tuple[Float32, Int64 | None]:
+    """The points to select among, and their rows in the cloud; None where these are all of it."""
+    document = session.document
+    points = session.points_world(document)
+    if within is None:
+        return points, None
+    own = [_existing(document, trunk_id).points for trunk_id in sorted(set(within))]
+    rows = np.sort(np.concatenate([*own, np.empty(0, np.int32)])).astype(np.int64)
+    return points[rows], rows
+
+
+def _owned(document: Document) -> np.ndarray:
+    """(N,) which points belong to a trunk."""
+    owned = np.zeros(document.source.n_points, bool)
+    for trunk in document.trunks:
+        owned[trunk.points] = True
+    return owned
+
+
+def _near(points: Float32, trunk: Trunk, distance: float) -> Int64:
+    """Rows of the points in the trunk's box, wider by a distance on all sides."""
+    own = points[trunk.points]
+    lower, upper = own.min(axis=0) - distance, own.max(axis=0) + distance
+    rows = np.flatnonzero((points[:, 0] >= lower[0]) & (points[:, 0] <= upper[0]))
+    for axis in (1, 2):
+        rows = rows[(points[rows, axis] >= lower[axis]) & (points[rows, axis] <= upper[axis])]
+    return rows
