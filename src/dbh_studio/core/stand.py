@@ -1,9 +1,9 @@
 """The stand table: stems and basal area per hectare, quadratic mean diameter, diameter classes, per species.
 
 Definitions as in forest mensuration (Avery and Burkhart, *Forest Measurements*): basal area is π d² / 4 at breast
-height, the quadratic mean diameter is that of the tree of mean basal area. Area is horizontal. A tree on the edge of the
-plot belongs to it if its centre does. Stems without a diameter are counted and stated, never taken as 0: basal area and
-mean diameter are those of the stems measured.
+height, the quadratic mean diameter is that of the tree of mean basal area. Area is horizontal. A tree on the edge of
+the plot belongs to it if its centre does. Stems without a diameter are counted and stated, never taken as 0: basal area
+and mean diameter are those of the stems measured.
 """
 
 from __future__ import annotations
