@@ -54,6 +54,7 @@ COMPONENTS = (
         "pye57", ("pye57",), "E57 files cannot be read; the other formats can.", no_wheel_on=(MAC_INTEL, LINUX_ARM)
     ),
     Component("trimesh", ("trimesh",), "Meshes (OBJ, STL, GLB) cannot be read; point clouds can."),
+    Component("xlsxwriter", ("xlsxwriter",), "Excel workbooks cannot be written; the other exports can."),
     Component(
         "pyproj",
         ("pyproj",),

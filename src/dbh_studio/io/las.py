@@ -136,14 +136,13 @@ def _read(path: Path, progress: Progress, attributes: Attributes, *, keep_noise:
             colour_dtype=np.uint16 if coloured else None,
             attribute_dtypes=dtypes,
         )
-        noise = _NOISE_SINCE_14 if header.point_format.id >= 6 else _NOISE
         done = n_noise = 0
         chunk = max(1, min(CHUNK_POINTS, _CHUNK_BYTES // header.point_format.size))
         for points in _one_ahead(reader.chunk_iterator(chunk)):
             xyz = _coordinates(points, header)
             rgb = np.stack([points.red, points.green, points.blue], axis=1) if coloured else None
             values = {name: np.asarray(points[name]) for name in dtypes}
-            is_good = ~np.isin(values["classification"], noise)
+            is_good = ~is_noise(points, header)
             n_noise += len(is_good) - int(np.count_nonzero(is_good))
             if not keep_noise and not is_good.all():
                 xyz, rgb = xyz[is_good], None if rgb is None else rgb[is_good]
@@ -163,6 +162,12 @@ def _read(path: Path, progress: Progress, attributes: Attributes, *, keep_noise:
         (*notes, *_noise_note(n_noise, keep_noise), *dropped),
         Provenance(kind, software, metres_per_unit, geographic),
     )
+
+
+def is_noise(points: Any, header: Any) -> NDArray[np.bool_]:
+    """(n,) which points of a chunk the file classifies as noise."""
+    noise = _NOISE_SINCE_14 if header.point_format.id >= 6 else _NOISE
+    return np.isin(np.asarray(points.classification), noise)
 
 
 def _one_ahead(chunks: Iterator[Any]) -> Iterator[Any]:

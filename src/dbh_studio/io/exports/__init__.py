@@ -1,0 +1,20 @@
+"""The inventory in the formats it is handed in, all made of the one table, so that ids and numbers agree."""
+
+from dbh_studio.io.exports.cloud_las import write_labelled_cloud
+from dbh_studio.io.exports.columns import Column, Table, table_of
+from dbh_studio.io.exports.drawing import write_dxf, write_svg
+from dbh_studio.io.exports.geojson import write_geojson
+from dbh_studio.io.exports.geopackage import write_geopackage
+from dbh_studio.io.exports.spreadsheet import write_xlsx
+
+__all__ = [
+    "Column",
+    "Table",
+    "table_of",
+    "write_dxf",
+    "write_geojson",
+    "write_geopackage",
+    "write_labelled_cloud",
+    "write_svg",
+    "write_xlsx",
+]
