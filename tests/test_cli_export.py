@@ -91,7 +91,7 @@ def test_nothing_is_overwritten_unasked_and_the_source_never(saved, tmp_path, ca
     out = tmp_path / "out"
     succeeds(capsys, saved, "--out", out, "--format", "gpkg")
     before = (out / "stand.gpkg").read_bytes()
-    assert "--overwrite" in fails(capsys, saved, "--out", out, "--format", "csv", "--format", "gpkg")
+    assert "already" in fails(capsys, saved, "--out", out, "--format", "csv", "--format", "gpkg")
     assert (out / "stand.gpkg").read_bytes() == before and not (out / "stand_inventory.csv").exists()
     succeeds(capsys, saved, "--out", out, "--format", "gpkg", "--overwrite")
     shutil.copy(saved.parent / "stand.laz", saved.parent / "stand_trees.laz")

@@ -1,0 +1,297 @@
+"""Evaluating inventories against a reference: from files or the open plot to a folder with table, pairs and figures."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dbh_studio import __version__
+from dbh_studio.core.comparison import Comparison, Grouping, compare
+from dbh_studio.core.evaluation import ALL, Sample
+from dbh_studio.core.evaluation_figures import SectionPicture, boxes_svg, scatter_svg, sections_svg
+from dbh_studio.core.stem_layout import PairingRule
+from dbh_studio.core.stem_table import StemTable, combined
+from dbh_studio.errors import FileError, MalformedFileError
+from dbh_studio.io.atomic import atomic_file
+from dbh_studio.io.evaluation_report import (
+    REMARKS,
+    line_values,
+    markdown_text,
+    pairs_csv,
+    table_csv,
+    table_latex,
+    table_markdown,
+)
+from dbh_studio.io.inventory_csv import check_not_source, inventory_csv
+from dbh_studio.io.table_columns import Reading, read_stem_table, stem_table_of
+
+if TYPE_CHECKING:
+    from dbh_studio.app.session import Session
+
+_KIND = "dbh-studio evaluation"
+_RECORD = "evaluation.json"
+_SECTIONS_SHOWN = 12
+_PAPERS_CURVES = ("fourier", "ellipse", "bspline")
+_MOST_PANELS = 24
+
+
+@dataclass(frozen=True)
+class EvaluationRequest:
+    """What to compare, and how.
+
+    Attributes:
+        reference: The file with the diameters believed.
+        inventories: The files compared with it; none where the open plot is.
+        by: What to tell stems apart by.
+        rule: How stems are paired.
+        inventory_reading: How the inventories are read.
+        reference_reading: How the reference is read.
+        combine_stems: Join stems with one number into trees of √Σd², in all tables.
+        pool: Take the inventories for samples of one thing rather than for rival methods.
+    """
+
+    reference: Path
+    inventories: tuple[Path, ...] = ()
+    by: tuple[Grouping, ...] = ()
+    rule: PairingRule = field(default_factory=PairingRule)
+    inventory_reading: Reading = field(default_factory=lambda: Reading(find_methods=True))
+    reference_reading: Reading = field(default_factory=Reading)
+    combine_stems: bool = False
+    pool: bool = False
+
+
+def evaluate_files(request: EvaluationRequest) -> Comparison:
+    """Evaluate inventories that lie in files.
+
+    Raises:
+        FileError: A table cannot be read or understood; says what to do.
+        StudioError: The tables cannot be paired.
+    """
+    tables = [read_stem_table(path, request.inventory_reading) for path in request.inventories]
+    return _compared(tables, request)
+
+
+def evaluate_plot(session: Session, request: EvaluationRequest) -> Comparison:
+    """Evaluate the open plot as it is measured now.
+
+    Raises:
+        FileError: The reference cannot be read or understood.
+        StudioError: They cannot be paired.
+    """
+    document = session.document
+    content = inventory_csv(session.inventory(document=document))
+    table = stem_table_of(content, request.inventory_reading, name=document.plot_id or "this plot")
+    return _compared([table], request)
+
+
+def _compared(tables: Sequence[StemTable], request: EvaluationRequest) -> Comparison:
+    reference = read_stem_table(request.reference, request.reference_reading)
+    if request.combine_stems:
+        tables, reference = [combined(table) for table in tables], combined(reference)
+    main = reference.methods[0]
+    if not any(math.isfinite(value) for value in reference.diameters_cm[main].tolist()):
+        raise MalformedFileError(
+            request.reference, "it has no usable diameter.", "Name the column that holds them: dbh=COLUMN."
+        )
+    return compare(tables, reference, by=request.by, rule=request.rule, pool=request.pool)
+
+
+# ---- the folder
+
+
+def report_files(comparison: Comparison, pictures: Sequence[SectionPicture] = ()) -> dict[str, bytes]:
+    """The content of a report folder by file name."""
+    columns = tuple(comparison.categories)
+    files = {
+        "table.csv": table_csv(comparison.lines),
+        "table.md": table_markdown(comparison.lines).encode(),
+        "table.tex": table_latex(comparison.lines).encode(),
+        "pairs.csv": pairs_csv(comparison.samples, columns),
+    }
+    methods = comparison.methods
+    for column in ("", *columns):
+        panels = _panels(comparison, column)
+        suffix = f"_by_{_file_word(column, columns)}" if column else ""
+        files[f"scatter{suffix}.svg"] = scatter_svg(panels, methods).encode()
+        files[f"relative_error{suffix}.svg"] = boxes_svg(panels, methods).encode()
+    if pictures:
+        files["sections.svg"] = sections_svg(pictures).encode()
+    files["report.md"] = _report(comparison, [name for name in files if name.endswith(".svg")]).encode()
+    files[_RECORD] = json.dumps(record(comparison), indent=1, ensure_ascii=False, allow_nan=False).encode()
+    return files
+
+
+def write_report(
+    comparison: Comparison,
+    folder: Path,
+    *,
+    pictures: Sequence[SectionPicture] = (),
+    sources: Sequence[Path] = (),
+    overwrite: bool = False,
+) -> tuple[Path, ...]:
+    """Write the report; an earlier one in the same folder is replaced.
+
+    Args:
+        comparison: What was found.
+        folder: Made where it is not there.
+        pictures: Cross-sections to show.
+        sources: Files that must not be written over.
+        overwrite: Replace files of the same names that no evaluation wrote.
+
+    Raises:
+        FileError: The folder cannot be written, or holds files of these names that no evaluation wrote.
+    """
+    files = report_files(comparison, pictures)
+    in_the_way = [name for name in files if (folder / name).exists()]
+    if in_the_way and not overwrite and not _is_report(folder):
+        raise FileError(
+            folder / in_the_way[0],
+            "there is such a file already, and no evaluation wrote it.",
+            "Choose another folder, or say that it may be overwritten.",
+        )
+    for name in files:
+        check_not_source(folder / name, [path for path in sources if path.is_file()])
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # The record last: a folder that was begun by somebody else is not taken for ours.
+        for name, content in files.items():
+            with atomic_file(folder / name) as file:
+                file.write(content)
+    except OSError as error:
+        raise FileError(
+            folder,
+            f"The report could not be written ({error.strerror or error}).",
+            "Make room on the disk, or choose another folder.",
+        ) from error
+    return tuple(folder / name for name in files)
+
+
+def record(comparison: Comparison) -> dict[str, Any]:
+    """The table and how it came about, for programs."""
+    frames = [
+        {
+            "inventory": table.name,
+            "plot": frame.plot,
+            "is_moved": frame.is_moved,
+            "turn_deg": frame.turn_deg,
+            "moved_m": frame.moved_m,
+            "pairs": frame.n_pairs,
+            "rms_m": frame.rms_m if math.isfinite(frame.rms_m) else None,
+            "reason": frame.reason,
+        }
+        for table, pairing in zip(comparison.inventories, comparison.pairings, strict=True)
+        for frame in pairing.frames
+    ]
+    return {
+        "kind": _KIND,
+        "schema_version": 1,
+        "version": __version__,
+        "reference": comparison.reference.name,
+        "inventories": [table.name for table in comparison.inventories],
+        "paired_by": [pairing.by for pairing in comparison.pairings],
+        "frames": frames,
+        "notes": list(comparison.notes),
+        "lines": [line_values(line) for line in comparison.lines],
+    }
+
+
+def _is_report(folder: Path) -> bool:
+    try:
+        content = json.loads((folder / _RECORD).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and content.get("kind") == _KIND
+
+
+def _file_word(column: str, columns: Sequence[str]) -> str:
+    """A column's name as part of a file name; its number behind it where two would be the same."""
+    words = ["".join(c if c.isascii() and c.isalnum() else "_" for c in name)[:60] for name in columns]
+    k = list(columns).index(column)
+    word = words[k] or "column"
+    return word if [w.casefold() for w in words].count(words[k].casefold()) == 1 else f"{word}_{k + 1}"
+
+
+def _panels(comparison: Comparison, column: str) -> Mapping[str, list[Sample]]:
+    if not column:
+        return {ALL: list(comparison.samples)}
+    names = comparison.categories[column][:_MOST_PANELS]
+    return {f"{column}: {name}": [s for s in comparison.samples if s.groups.get(column) == name] for name in names}
+
+
+def _report(comparison: Comparison, figures: Sequence[str]) -> str:
+    names = ", ".join(table.name for table in comparison.inventories)
+    parts = [
+        f"# {markdown_text(names)} against {markdown_text(comparison.reference.name)}",
+        table_markdown(comparison.lines),
+        REMARKS,
+        "## How it was read and paired",
+        "\n".join(f"- {markdown_text(note)}" for note in comparison.notes),
+        "Every stem is in [pairs.csv](pairs.csv), with the reason where it does not count.",
+        "## Figures",
+        "\n".join(f"![{name.removesuffix('.svg')}]({name})" for name in figures),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+# ---- cross-sections
+
+
+def section_pictures(session: Session, comparison: Comparison) -> tuple[SectionPicture, ...]:
+    """Cross-sections of a plot's stems with the chosen curve and the paper's three: the best, middling and worst pairs.
+
+    Args:
+        session: The plot the first inventory was measured in.
+        comparison: Its evaluation.
+    """
+    from dbh_studio.core.measured import CurveFit, DbhEstimate
+    from dbh_studio.stages.measure import measure_trunk
+
+    document = session.document
+    trunk_ids = stem_numbers(comparison)
+    method = comparison.methods[0]
+    known = [s for s in comparison.samples if s.method == method and s.error_pct is not None and s.stem in trunk_ids]
+    known = [s for s in known if trunk_ids[s.stem] in document.trunks]
+    pictures = []
+    for word, sample in _spread(sorted(known, key=lambda s: abs(s.error_pct or 0.0))):
+        result = measure_trunk(
+            session.points_world(document)[document.trunks[trunk_ids[sample.stem]].points],
+            trunk_id=trunk_ids[sample.stem],
+            ground=session.ground(document=document),
+            settings=document.settings.measure,
+            curves=_PAPERS_CURVES,
+        ).result
+        if not isinstance(result, DbhEstimate) or sample.reference_cm is None:
+            continue
+        fits = {name: fit for name, fit in result.fits.items() if isinstance(fit, CurveFit)}
+        chosen = fits.get(result.curve)
+        if chosen is None:
+            continue
+        outlines = {name: fit.outline_uv_m for name, fit in sorted(fits.items(), key=lambda f: f[0] != result.curve)}
+        title = f"{word}tree {sample.tree or sample.stem} ({sample.error_pct:+.1f} %)"
+        pictures.append(SectionPicture(title, result.section.uv_m, chosen.inliers, outlines, sample.reference_cm))
+    return tuple(pictures)
+
+
+def stem_numbers(comparison: Comparison) -> dict[str, int]:
+    """The studio's number of each stem of the first inventory, by the number it has in the evaluation."""
+    table = comparison.inventories[0]
+    own = table.cells.get("stem_id", table.ids)
+    return {name: int(text) for name, text in zip(table.ids, own, strict=True) if text.isdigit()}
+
+
+def _spread(ordered: Sequence[Sample]) -> list[tuple[str, Sample]]:
+    """A third each of the best, the middling and the worst; all where there are few."""
+    third = _SECTIONS_SHOWN // 3
+    if len(ordered) <= _SECTIONS_SHOWN:
+        return [("", sample) for sample in ordered]
+    middle = (len(ordered) - third) // 2
+    parts = (
+        ("good: ", ordered[:third]),
+        ("middling: ", ordered[middle : middle + third]),
+        ("worst: ", ordered[-third:]),
+    )
+    return [(word, sample) for word, part in parts for sample in part]

@@ -1,0 +1,217 @@
+"""The plot against diameters measured in the field: a part of the Export step."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import viser
+
+from dbh_studio.core.evaluation import ALL, MIN_N, Line, Sample
+from dbh_studio.core.evaluation_figures import sample_title, scatter_svg
+from dbh_studio.errors import StudioError
+from dbh_studio.ui import html
+from dbh_studio.ui.bridge import call, esc
+from dbh_studio.ui.panels.base import set_content, set_value, set_visible, typed_path
+
+if TYPE_CHECKING:
+    from dbh_studio.app.document import Document
+    from dbh_studio.app.evaluation import EvaluationRequest
+    from dbh_studio.app.session import Session
+    from dbh_studio.core.comparison import Comparison
+    from dbh_studio.core.stem_layout import PairBy
+    from dbh_studio.ui.tab import Tab
+
+_PAIR_BY: dict[str, PairBy] = {"as found": "auto", "number": "id", "place": "position"}
+_WORST_SHOWN = 15
+_OTHERS_SHOWN = 10
+
+
+class EvaluationSection:
+    """Built at the GUI's current place, in a panel that brings it in step with the plot."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab = tab
+        self._done: tuple[Session, Document, EvaluationRequest, Comparison] | None = None
+        gui, worker = tab.client.gui, tab.worker
+        self._folder = gui.add_folder("Compare with field measurements", expand_by_default=False, visible=False)
+        with self._folder:
+            self._path = gui.add_text(
+                "Field table",
+                "",
+                hint="on the computer the studio runs on: a CSV with diameters measured by tape or calliper",
+            )
+            self._by = gui.add_dropdown(
+                "Pair by", tuple(_PAIR_BY), hint="as found: by number where the places agree with it, else by place"
+            )
+            compare = gui.add_button("Compare", icon=viser.Icon.SCALE, color="green")
+            worker.on_click(compare, self._compare)
+            self._state = gui.add_html("")
+            self._plot = gui.add_html("", visible=False)
+            self._worst = gui.add_html("", visible=False)
+            self._out = gui.add_text(
+                "Report folder", "", visible=False, hint="table, pairs and figures are written there, on this computer"
+            )
+            self._write = gui.add_button("Write the report", icon=viser.Icon.FILE_EXPORT, color="gray", visible=False)
+            worker.on_click(self._write, self._write_report)
+
+    def refresh(self) -> None:
+        """Say what was found, and whether the plot has changed since."""
+        session = self.tab.session
+        set_visible(self._folder, session is not None and len(session.document.trunks) > 0)
+        if self._done is not None and self._done[0] is not session:
+            self._done = None
+        for handle in (self._plot, self._worst, self._out, self._write):
+            set_visible(handle, self._done is not None)
+        if self._done is None or session is None:
+            set_content(
+                self._state,
+                html.message("Type where a table with field diameters lies: its columns and units are found out."),
+            )
+            return
+        _, document, _, comparison = self._done
+        is_old = session.document is not document
+        old = html.message("The plot has changed since. Press Compare again.") if is_old else ""
+        set_content(self._state, old + summary(comparison))
+        set_content(self._plot, scatter(comparison))
+        set_content(self._worst, misfits(comparison))
+
+    def _compare(self) -> None:
+        # Here, not above: scipy takes a second to import, and most sessions compare nothing.
+        from dbh_studio.app.evaluation import EvaluationRequest, evaluate_plot
+        from dbh_studio.core.stem_layout import PairingRule
+
+        session = self.tab.require_session()
+        path = typed_path(self._path.value)
+        if path is None:
+            raise StudioError("No table was named.", "Type the path of a table with diameters measured in the field.")
+        document = session.document
+        _check_measured(session, document)
+        request = EvaluationRequest(path, rule=PairingRule(_PAIR_BY[self._by.value]))
+        self._done = None  # what is on screen must not pass for the answer while this one fails
+        try:
+            comparison = evaluate_plot(session, request)
+            self._done = session, document, request, comparison
+            if not self._out.value:
+                set_value(self._out, str(_beside(session) / f"{document.plot_id or 'plot'}_evaluation"))
+        finally:
+            self.refresh()
+
+    def _write_report(self) -> None:
+        from dbh_studio.app.evaluation import section_pictures, write_report
+
+        if self._done is None:
+            raise StudioError("Nothing was compared yet.", "Press Compare first.")
+        session, document, request, comparison = self._done
+        text = self._out.value.strip().strip("\"'")
+        if not text:
+            raise StudioError("No folder was named.", "Type where the report shall go.")
+        folder = _beside(session) / os.path.expanduser(text)  # noqa: PTH111 - pathlib's raises
+        # Cross-sections are those of the plot as it is: they may only stand beside the numbers of the same state.
+        pictures = section_pictures(session, comparison) if session.document is document else ()
+        written = write_report(comparison, folder, pictures=pictures, sources=[request.reference])
+        self.tab.worker.notify("Report written", f"{len(written)} files in {folder}; begin with report.md.", "success")
+
+
+def _check_measured(session: Session, document: Document) -> None:
+    session.require_scale()
+    n_waiting = len(session.unmeasured(document))
+    if n_waiting:
+        raise StudioError(f"{n_waiting} trees are not measured yet.", "Wait for it, or press Measure above.")
+
+
+def _beside(session: Session) -> Path:
+    """The folder the plot lies in."""
+    folder = getattr(session.saver, "folder", None)
+    return Path(folder if folder is not None else session.document.source.path).absolute().parent
+
+
+def _whole(comparison: Comparison) -> Line:
+    return next(line for line in comparison.lines if line.category == ALL)
+
+
+def summary(comparison: Comparison) -> str:
+    """HTML: bias, scatter and counts."""
+    line = _whole(comparison)
+    s = line.statistics
+    pairs = [("Trees with both diameters", str(s.n))]
+    if s.median_bias_cm is not None and s.mean_bias_cm is not None and s.rmse_cm is not None:
+        pairs += [
+            ("Median bias", f"{s.median_bias_cm:+.2f} cm"),
+            ("Mean bias", f"{s.mean_bias_cm:+.2f} cm"),
+            ("RMSE", f"{s.rmse_cm:.2f} cm"),
+            ("MAD, rCV", f"{s.mad_cm:.2f} cm, {s.rcv_pct:.1f} %"),
+            ("Median relative error", f"{s.median_rel_err_pct:.1f} %"),
+        ]
+    if s.r_squared is not None:
+        pairs.append(("R²", f"{s.r_squared:.3f}"))
+    if s.n_intervals:
+        pairs.append(("Interval holds the field value", f"{s.n_covered} of {s.n_intervals}"))
+    n_found = line.n_measured + line.n_refused
+    pairs.append(("Field trees found", f"{n_found} of {line.n_reference}"))
+    pairs.append(("Found without a diameter", str(line.n_refused)))
+    pairs.append(("Only in this plot", str(line.n_extra)))
+    few = "" if s.n >= MIN_N else html.message(f"{s.n} trees are too few for bias and scatter: {MIN_N} are needed.")
+    return f'{few}<div class="dbh">{html.facts(pairs)}</div>'
+
+
+def scatter(comparison: Comparison) -> str:
+    """HTML: estimated against reference; a point names its tree, and a click on it chooses the tree."""
+    numbers = _numbers(comparison)
+
+    def marks(sample: Sample) -> str:
+        number = numbers.get(sample.stem)
+        if number is None:
+            return ""
+        return f'data-tree="{number}" style="cursor:pointer" onclick="{call("row", number)}"'
+
+    picture = scatter_svg({"": comparison.samples}, comparison.methods, marks=marks, is_fluid=True)
+    return f'<div class="dbh dbh-evaluation">{picture}</div>'
+
+
+def misfits(comparison: Comparison) -> str:
+    """HTML: the pairs that do not fit, worst first, then what has no pair and why, and how the tables were read."""
+    numbers = _numbers(comparison)
+    samples = [s for s in comparison.samples if s.method == comparison.methods[0]]
+    measured = sorted((s for s in samples if s.error_pct is not None), key=lambda s: -abs(s.error_pct or 0.0))
+    rows = "".join(_row(sample, numbers.get(sample.stem)) for sample in measured[:_WORST_SHOWN])
+    table = (
+        '<div class="dbh-scroll" tabindex="0"><table class="dbh-table"><thead><tr><th>Tree</th><th>Field</th>'
+        f"<th>DBH</th><th>Tape</th><th>Error %</th></tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+    items = []
+    for outcome, words in (
+        ("refused", "has no diameter"),
+        ("missed", "was not found"),
+        ("unknown", "has no field diameter"),
+    ):
+        some = [s for s in samples if s.outcome == outcome]
+        items += [("note", f"Field tree {s.tree or '?'} {words}", s.reason) for s in some[:_OTHERS_SHOWN]]
+        if len(some) > _OTHERS_SHOWN:
+            items.append(("note", f"{len(some) - _OTHERS_SHOWN} more: the report lists them", ""))
+    title = '<div class="muted">Worst pairs first, centimetres; click one to see the tree.</div>'
+    notes = html.findings([("note", note, "") for note in comparison.notes])
+    how = f'<details class="dbh"><summary>How the tables were read and paired</summary>{notes}</details>'
+    return f'<div class="dbh">{title}{table if rows else ""}</div>{html.findings(items) if items else ""}{how}'
+
+
+def _row(sample: Sample, number: int | None) -> str:
+    click = f' onclick="{call("row", number)}"' if number is not None else ""
+    shown = (
+        str(number) if number is not None else sample.stem,
+        sample.tree,
+        f"{sample.estimated_cm:.1f}",
+        f"{sample.reference_cm:.1f}",
+        f"{sample.error_pct:+.1f}",
+    )
+    cells = "".join(f"<td>{esc(text)}</td>" for text in shown)
+    tip = esc(sample_title(replace(sample, plot="")))
+    return f'<tr data-pair="{esc(shown[0])}" title="{tip}"{click}>{cells}</tr>'
+
+
+def _numbers(comparison: Comparison) -> dict[str, int]:
+    from dbh_studio.app.evaluation import stem_numbers
+
+    return stem_numbers(comparison)
