@@ -17,6 +17,7 @@
     │   ├── ProjectMismatchError    its trunks are those of another cloud
     │   └── ProjectVersionError     written by a newer program
     ├── StaleResultError            the plot changed while a job ran
+    ├── AlignmentError              two clouds cannot be laid on each other
     ├── CommandError                an edit that cannot be applied
     └── CancelledError              the person pressed Cancel
 
@@ -118,6 +119,10 @@ class ProjectVersionError(ProjectError):
 
 class StaleResultError(StudioError):
     """What a job read has changed since it started; its result was not applied."""
+
+
+class AlignmentError(StudioError):
+    """Two clouds of one plot cannot be laid on each other."""
 
 
 class CommandError(StudioError):

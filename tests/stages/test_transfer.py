@@ -1,4 +1,4 @@
-"""Labels from a photogrammetric cloud to a laser scan of the same plot: alignment, refusals, carrying, trunks."""
+"""Labels from a photogrammetric cloud to a laser scan of the same plot: ways to align them, and refusals."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ from dbh_studio.core.dbh import Refusal
 from dbh_studio.core.ground import fit_ground
 from dbh_studio.core.synthetic.plot import make_plot
 from dbh_studio.core.synthetic.recipe import PlotRecipe
+from dbh_studio.core.trajectories import Trajectory
 from dbh_studio.core.transforms import Similarity
+from dbh_studio.stages.measure import measure_trunk
 from dbh_studio.stages.transfer import (
     Survey,
     align_as_given,
     align_by_pairs,
     align_by_stems,
-    carried_trunks,
-    carry_labels,
+    align_by_trajectories,
     refined,
+    scale_error_of_surfaces,
+    stems_together,
     survey,
+    survey_of_stems,
 )
 
 TRUTH = Similarity(Rotation.from_rotvec([0.012, -0.008, 2.0]).as_matrix(), np.array([30.0, -12.0, 4.0]))
@@ -112,40 +116,76 @@ def test_a_given_transform_is_taken_and_a_wrong_one_shows_when_refined():
     assert isinstance(refusal, Refusal) and refusal.code == "no_overlap"
 
 
-@pytest.mark.parametrize(("rivals", "precision"), [(True, 0.97), (False, 0.93)])
-def test_labels_arrive_on_the_right_points(rivals, precision):
-    source, labels, target, truth = plots()
-    carried = carry_labels(source, labels, target, aligned().target_from_source, rivals=rivals)
-    marked = carried.labels > 0
-    assert (carried.labels[marked] == truth[marked]).mean() > precision
-    there = np.isin(truth, np.unique(labels[labels > 0]))
-    assert (carried.labels == truth)[there].mean() > 0.8
-    assert set(carried.trunk_ids) | set(carried.lost) == set(np.unique(labels[labels > 0]).tolist())
+# ---- by the walks
 
 
-def test_what_is_beyond_the_reach_or_nearer_to_something_else_gets_no_label():
-    source = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0.1, 0]])
-    target = np.array([[0.15, 0, 0], [0.25, 0, 0], [1.0, 0.09, 0], [1.0, 0.04, 0], [9.0, 0, 0]])
-    same = Similarity.identity()
-    labels = np.array([4, 7, 0])
-    assert carry_labels(source, labels, target, same).labels.tolist() == [4, 0, 0, 7, 0]
-    assert carry_labels(source, labels, target, same, rivals=False).labels.tolist() == [4, 0, 7, 7, 0]
-    far = carry_labels(source, labels, target + 100.0, same)
-    assert far.trunk_ids == () and far.lost == (4, 7) and not far.labels.any()
+def walk(t):
+    """(N, 3) metres through the plot, never twice the same."""
+    return np.column_stack([6 + 5 * np.sin(0.11 * t), 7 + 6 * np.cos(0.073 * t), 1.6 + 0.1 * np.sin(0.4 * t)])
 
 
-def test_nothing_to_carry_is_no_error():
-    empty = carry_labels(np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros((4, 3)), Similarity.identity())
-    assert empty.labels.tolist() == [0] * 4
-    with pytest.raises(ValueError, match="source_labels"):
-        carry_labels(np.zeros((3, 3)), np.zeros(2, np.int32), np.zeros((4, 3)), Similarity.identity())
+def walks(*, offset=12.5, n=120):
+    rng = np.random.default_rng(3)
+    mine, theirs = np.linspace(4, 90, n), np.linspace(0, 86, 500)
+    source = Trajectory(mine, (walk(mine) + rng.normal(0, 0.02, (n, 3))) * UNIT)
+    return source, Trajectory(theirs + offset, TRUTH.apply(walk(theirs) + rng.normal(0, 0.01, (500, 3))))
 
 
-def test_the_chain_makes_trunks_of_carried_labels_and_keeps_their_names():
-    source, labels, target, truth = plots()
-    carried = carry_labels(source, labels, target, aligned().target_from_source)
-    trunks = carried_trunks(target, fit_ground(target), carried)
-    names = [name for name in trunks.source_ids if name]
-    assert len(names) == len(set(names)) >= 5
-    for rows, name in zip(trunks.result.point_sets, trunks.source_ids, strict=True):
-        assert (truth[rows] == name).mean() > 0.9
+def test_walks_align_the_clouds_and_tell_the_clocks_and_how_sure_that_is():
+    alignment = align_by_trajectories(*walks())
+    assert alignment and alignment.method == "trajectories" and alignment.walk is not None
+    assert alignment.walk.offset_s == pytest.approx(12.5, abs=0.05)
+    assert worst_error(alignment) < 0.08
+    scale = alignment.target_from_source.scale
+    assert abs(scale * UNIT - 1.0) < 4 * alignment.scale_error < 0.02
+    assert any("clock" in note for note in alignment.notes)
+    better = refined(alignment, *surveys(), with_scale=True)
+    assert better and worst_error(better) < 0.02
+    share = scale_error_of_surfaces(*surveys(), better)
+    assert 0.0 < share < 0.003 and abs(better.target_from_source.scale * UNIT - 1.0) < 5 * share + 5e-4
+
+
+def test_stems_stand_on_stems_where_the_clouds_lie_right():
+    source, target = surveys()
+    known = Similarity(TRUTH.rotation, TRUTH.translation, 1.0 / UNIT)
+    n = stems_together(source, target, known)
+    assert n >= 5
+    off = Similarity(TRUTH.rotation, TRUTH.translation + [1.7, -1.1, 0.0], 1.0 / UNIT)
+    assert stems_together(source, target, off) < n / 2
+    sunk = Similarity(TRUTH.rotation, TRUTH.translation + [0.0, 0.0, 3.0], 1.0 / UNIT)
+    assert stems_together(source, target, sunk) == 0
+
+
+def straight(trajectory, direction):
+    along = np.linspace(0, 30, len(trajectory)) + 0.5 * np.sin(np.linspace(0, 9, len(trajectory)))
+    return Trajectory(trajectory.time_s, along[:, None] * direction)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "says"),
+    [
+        (lambda a, b: (Trajectory(a.time_s[:6], a.xyz[:6]), b, None), "too_few_poses", "the camera has 6 poses"),
+        (lambda a, b: (a, b, 5000.0), "no_common_time", "0 poses fall together"),
+        (lambda a, b: (a, Trajectory(b.time_s / 1000, b.xyz), None), "no_common_time", "86 and 0 s"),
+        (lambda a, b: (straight(a, [1.0, 0.2, 0]), straight(b, [0.3, 1.0, 0]), 12.5), "straight", "straight line"),
+        (lambda a, b: (a, Trajectory(b.time_s, walk(3.1 * b.time_s + 40)), 12.5), "other_walk", "differ by"),
+    ],
+)
+def test_walks_that_do_not_determine_it_are_refused(spoil, code, says):
+    source, target, offset = spoil(*walks())
+    refusal = align_by_trajectories(source, target, offset_s=offset)
+    assert isinstance(refusal, Refusal) and refusal.code == code
+    assert says in refusal.reason and refusal.remedy
+
+
+def test_a_survey_of_known_stems_is_like_one_that_looked_for_them():
+    _, _, target, truth = plots()
+    ground = fit_ground(target)
+    rows = [np.flatnonzero(truth == i).astype(np.int32) for i in (1, 2, 3)]
+    stems = [(part, measure_trunk(target[part], trunk_id=i, ground=ground)) for i, part in enumerate(rows, 1)]
+    known, seen = survey_of_stems(target, stems, ground), surveys()[1]
+    apart = np.linalg.norm(known.xy_m[:, None] - seen.xy_m[None], axis=2)
+    assert apart.min(axis=1).max() < 0.05
+    nearest = apart.argmin(axis=1)
+    assert known.radius_m == pytest.approx(seen.radius_m[nearest], rel=0.15)
+    assert known.base_m == pytest.approx(seen.base_m[nearest], abs=0.05)

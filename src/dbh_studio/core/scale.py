@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 ScaleSource = Literal[
-    "unknown", "metres", "feet", "millimetres", "factor", "marker", "bars", "camera_height", "baseline"
+    "unknown", "metres", "feet", "millimetres", "factor", "marker", "bars", "camera_height", "baseline", "lidar"
 ]
 # Where nothing better exists: how high a person holds a camera, and how far apart two photos are said to be.
 WEAK_SOURCES: frozenset[ScaleSource] = frozenset({"camera_height", "baseline"})
@@ -40,6 +40,11 @@ class ScaleEstimate:
     def is_weak(self) -> bool:
         """Whether it rests on what a person can only guess."""
         return self.source in WEAK_SOURCES
+
+    @property
+    def relative_sd(self) -> float:
+        """Relative standard error; 0 where nothing is known of it, which is no claim that it is 0."""
+        return 0.0 if self.standard_error is None else self.standard_error / self.metres_per_unit
 
     @property
     def is_known(self) -> bool:

@@ -23,7 +23,7 @@ class Trunk:
     Attributes:
         id: From 1 to `MAX_TRUNK_ID`, never reused within a plot.
         points: (K,) sorted, unique indices into the plot's cloud.
-        origin: Where it came from: ``geometry``, ``file``, ``masks`` or ``hand``.
+        origin: Where it came from: ``geometry``, ``file``, ``masks``, ``hand``, or ``carried`` from another cloud.
     """
 
     id: int

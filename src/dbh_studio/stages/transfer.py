@@ -1,41 +1,57 @@
-"""Trunks from one cloud to another of the same plot: from photogrammetry to LiDAR, as in the paper, or back.
+"""One cloud laid on another of the same plot: photogrammetry on LiDAR, as in the paper, or the other way round.
 
-    photo, lidar = survey(points_a, ground_a), survey(points_b, ground_b)
-    alignment = align_by_stems(photo, lidar)            or align_by_trajectories, align_by_pairs, align_as_given
+    alignment = align_by_trajectories(camera, scanner)  or align_by_stems, align_by_pairs, align_as_given
     if not alignment: ...                               a Refusal says why and what to do
-    carried = carry_labels(points_a, labels, points_b, alignment.target_from_source)
-    trunks = carried_trunks(points_b, ground_b, carried)
+    photo, lidar = survey_of_stems(points_a, stems, ground_a), survey(points_b, ground_b)
+    alignment = refined(alignment, photo, lidar, with_scale=True)
+
+Then `label_carry` carries the labels.
 
 Both clouds are upright in frames of their own; the source may have a unit of its own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
+from scipy.optimize import linear_sum_assignment
 
-from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64, as_points, readonly
-from dbh_studio.core.dbh import Refusal
+from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64, as_points
+from dbh_studio.core.dbh import DbhEstimate, Refusal
 from dbh_studio.core.ground import GroundModel
-from dbh_studio.core.neighbours import N_WORKERS
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.registration import refine
 from dbh_studio.core.similarity_fit import fit_similarity
 from dbh_studio.core.stem_match import StemMatch, match_stems
-from dbh_studio.core.trajectories import Trajectory, fit_trajectories
+from dbh_studio.core.trajectories import MIN_POSES, STRAIGHT, Trajectory, TrajectoryFit, common_poses, fit_trajectories
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.core.voxels import thin
 from dbh_studio.settings import TrunkSettings
+from dbh_studio.stages.measure import StemMeasurement
 from dbh_studio.stages.segment import SegmentationResult, segment_trunks
 
 _CHUNK = 1 << 20
 _GROUND_M = 0.15
 _FIRM_EDGE_M = 0.08
 _MOST_FIRM = 60_000
+_LAST_REACH_M = 0.08
+_WALK_CODES = {
+    "straight": "straight",
+    "several_offsets": "several_offsets",
+    "few_fit": "other_walk",
+    "differ": "other_walk",
+}
+_WALK_REMEDIES = {
+    "straight": "Walk a loop or a bend next time. Stems and ground tell it where both clouds show at least four stems.",
+    "several_offsets": "Give the offset of the clocks, if it is known. Stems tell it where both clouds show at least "
+    "four of them.",
+    "other_walk": "Look whether both are of one walk, whether the times are seconds, and whether each trajectory is in "
+    "the frame of its cloud.",
+}
 _PAIRS_REMEDY = "Pick three or more pairs of points that are the same in both clouds, far apart and not in one line."
 
 
@@ -72,6 +88,9 @@ class Alignment:
         surface_rms_m: Of stems and ground after refinement; NaN where it was not refined.
         share_near: Share of the source's stems and ground that has the target's beside it; NaN likewise.
         stem_pairs: (P, 2) rows of the two surveys that are the same stem.
+        walk: How the trajectories lie on each other; None where it does not rest on them.
+        scale_error: Standard error of the scale, as a share of it; None where it is fixed or not known.
+        rival_pairs: Stems that the best clearly different way brings together, where it rests on stems.
         notes: What the person should know.
     """
 
@@ -83,34 +102,9 @@ class Alignment:
     share_near: float = float("nan")
     stem_pairs: Int64 | None = None
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class CarriedLabels:
-    """Labels of the target's points.
-
-    Attributes:
-        labels: (M,) int32, 0 where no trunk is near.
-        trunk_ids: The labels that arrived, ascending.
-        lost: Labels of the source that no point of the target lies near to.
-    """
-
-    labels: Int32
-    trunk_ids: tuple[int, ...]
-    lost: tuple[int, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class CarriedTrunks:
-    """Trunks of the target cloud.
-
-    Attributes:
-        result: Of the paper's chain on the points that carry a label.
-        source_ids: Per trunk of `result` the label of the source it is; 0 where most of it has none.
-    """
-
-    result: SegmentationResult
-    source_ids: tuple[int, ...]
+    walk: TrajectoryFit | None = None
+    scale_error: float | None = None
+    rival_pairs: int = 0
 
 
 def survey(
@@ -136,10 +130,31 @@ def survey(
     xy = np.array([stem.xy_at(1.3) for stem, _ in stems], np.float64).reshape(-1, 2)
     radius = np.array([stem.radius_m for stem, _ in stems], np.float64)
     progress(0.9, "Gathering stems and ground")
-    firm = [_thinned(cloud[rows]) for _, rows in stems] + [_ground_points(cloud, ground)]
-    gathered = np.concatenate(firm)
+    base = ground.z_at(xy) if len(xy) else np.empty(0)
+    return _surveyed(cloud, xy, radius, base, [rows for _, rows in stems], ground)
+
+
+def survey_of_stems(points: Float, stems: Sequence[tuple[Int32, StemMeasurement]], ground: GroundModel) -> Survey:
+    """As `survey`, for a cloud whose trunks are known and measured.
+
+    Args:
+        points: (N, 3) metres, +z up.
+        stems: Rows of each trunk, and its measurement; the diameter may be refused.
+        ground: Of these points.
+    """
+    placed = [(rows, stem) for rows, stem in stems if np.isfinite(stem.xy_m).all() and np.isfinite(stem.z_ground_m)]
+    xy = np.array([stem.xy_m for _, stem in placed], np.float64).reshape(-1, 2)
+    radius = [0.005 * stem.result.dbh_cm if isinstance(stem.result, DbhEstimate) else np.nan for _, stem in placed]
+    base = np.array([stem.z_ground_m for _, stem in placed], np.float64)
+    return _surveyed(points, xy, np.array(radius, np.float64), base, [rows for rows, _ in stems], ground)
+
+
+def _surveyed(
+    points: Float, xy: Float64, radius: Float64, base: Float64, trunks: Sequence[Int32], ground: GroundModel
+) -> Survey:
+    gathered = np.concatenate([*(_thinned(points[rows]) for rows in trunks), _ground_points(points, ground)])
     kept = np.random.default_rng(0).permutation(len(gathered))[:_MOST_FIRM]
-    return Survey(xy, radius, ground.z_at(xy) if len(xy) else np.empty(0), gathered[kept])
+    return Survey(xy, radius, base, gathered[kept])
 
 
 def align_by_stems(
@@ -178,7 +193,12 @@ def align_by_stems(
     if not match:
         return Refusal("ambiguous", f"The clouds cannot be aligned by their stems: {match.reason}.", _PAIRS_REMEDY)
     alignment = Alignment(
-        _upright(match, source, target), "stems", len(match.pairs), match.rms_m, stem_pairs=match.pairs
+        _upright(match, source, target),
+        "stems",
+        len(match.pairs),
+        match.rms_m,
+        stem_pairs=match.pairs,
+        rival_pairs=match.rival_pairs,
     )
     if not with_refinement:
         return alignment
@@ -201,7 +221,12 @@ def align_by_pairs(source: ArrayLike, target: ArrayLike, *, with_scale: bool = T
 
 
 def align_by_trajectories(
-    source: Trajectory, target: Trajectory, *, with_scale: bool = True, offset_s: float | None = None
+    source: Trajectory,
+    target: Trajectory,
+    *,
+    with_scale: bool = True,
+    offset_s: float | None = None,
+    upright: bool = False,
 ) -> Alignment | Refusal:
     """The paper's way: from where the two sensors were at the same times.
 
@@ -210,14 +235,60 @@ def align_by_trajectories(
         target: Of the scanner, in the frame of the other cloud.
         with_scale: Whether the source's unit is unknown.
         offset_s: Target's clock minus the source's; None searches for it.
+        upright: Both frames have z up, so that even a straight walk leaves nothing open.
+
+    Returns:
+        The alignment; a refusal with the code ``too_few_poses``, ``no_common_time``, ``straight``,
+        ``several_offsets`` or ``other_walk``.
     """
-    fit = fit_trajectories(source, target, with_scale=with_scale, offset_s=offset_s)
-    if fit is None:
-        return Refusal("too_few_poses", "Too few poses of the two walks were at common times.", _PAIRS_REMEDY)
-    if not fit:
-        return Refusal("ambiguous", f"The clouds cannot be aligned by the walks: {fit.reason}.", _PAIRS_REMEDY)
-    notes = () if offset_s is not None else (f"The clocks differ by {fit.offset_s:.2f} s.",)
-    return Alignment(fit.target_from_source, "trajectories", fit.n_used, fit.rms_m, notes=notes)
+    named = (("the camera", source), ("the scanner", target))
+    few = [f"{name} has {len(walk)} poses" for name, walk in named if len(walk) < MIN_POSES]
+    if few:
+        return Refusal(
+            "too_few_poses",
+            f"The walks cannot be compared: {' and '.join(few)}, and at least {MIN_POSES} are needed.",
+            "Export every pose of the trajectory, not only key frames.",
+        )
+    fit = fit_trajectories(source, target, with_scale=with_scale, offset_s=offset_s, upright=upright)
+    if fit is None and not (source.is_line or target.is_line):
+        return _no_common_time(source, target, offset_s)
+    if fit is None or not fit:
+        code, reason = ("straight", STRAIGHT) if fit is None else (_WALK_CODES[fit.code], fit.reason)
+        return Refusal(code, f"The walks do not tell how the clouds lie: {reason}.", _WALK_REMEDIES[code])
+    notes: tuple[str, ...] = (
+        () if offset_s is not None else (f"The scanner's clock is {fit.offset_s:+.2f} s from the camera's.",)
+    )
+    n_left = fit.n_poses - fit.n_used
+    if n_left:
+        notes += (f"{n_left} of {fit.n_poses} poses are off and were left out.",)
+    return Alignment(
+        fit.target_from_source,
+        "trajectories",
+        fit.n_used,
+        fit.rms_m,
+        notes=notes,
+        walk=fit,
+        scale_error=fit.scale_error,
+    )
+
+
+def _no_common_time(source: Trajectory, target: Trajectory, offset_s: float | None) -> Refusal:
+    if offset_s is None:
+        lasted = f"{source.duration_s:.0f} and {target.duration_s:.0f} s"
+        return Refusal(
+            "no_common_time",
+            f"The walks cannot be compared: they lasted {lasted}, and at no offset of their clocks do "
+            f"{MIN_POSES} poses fall together.",
+            "Look whether the times are seconds, and whether both files are of one walk.",
+        )
+    n = common_poses(source, target, offset_s)
+    first, last = source.time_s[0] + offset_s, source.time_s[-1] + offset_s
+    return Refusal(
+        "no_common_time",
+        f"With this clock offset only {n} poses fall together: on the scanner's clock the camera's walk is "
+        f"{first:.1f} to {last:.1f} s, the scanner's {target.time_s[0]:.1f} to {target.time_s[-1]:.1f} s.",
+        "Leave the clock offset away, so that it is searched for, or give the right one.",
+    )
 
 
 def align_as_given(target_from_source: Similarity) -> Alignment:
@@ -253,83 +324,37 @@ def refined(
         surface_rms_m=better.rms_m,
         share_near=better.share_near,
         notes=notes,
+        scale_error=None,
     )
 
 
-def carry_labels(
-    source_points: Float,
-    source_labels: Int32,
-    target_points: Float,
-    target_from_source: Similarity,
-    *,
-    reach_m: float = 0.2,
-    rivals: bool = True,
-    margin_m: float = 0.03,
-    progress: Progress = ignore_progress,
-) -> CarriedLabels:
-    """Each point of the target takes the label of the nearest labelled point of the source.
-
-    Args:
-        source_points: (N, 3)
-        source_labels: (N,) 0 none, above 0 the trunk.
-        target_points: (M, 3) metres.
-        target_from_source: See `Alignment`.
-        reach_m: Not from farther away; the paper's is 0.2.
-        rivals: Whether points without a label compete: what lies nearer to a fern of the source than to its trunk is
-            no trunk. False is the paper's way.
-        margin_m: A rival must be nearer by this: clouds are not aligned to the millimetre.
-        progress: Called between chunks.
-
-    Raises:
-        ValueError: Wrong shapes.
-    """
-    source, target = as_points(source_points, name="source_points"), as_points(target_points, name="target_points")
-    given = np.asarray(source_labels, np.int32)
-    if given.shape != (len(source),):
-        raise ValueError(f"source_labels have shape {given.shape} but ({len(source)},) is needed")
-    labels = np.zeros(len(target), np.int32)
-    trunk_rows = np.flatnonzero(given > 0)
-    ids = tuple(int(name) for name in np.unique(given[trunk_rows]))
-    if not len(trunk_rows) or not len(target):
-        return CarriedLabels(readonly(labels), (), ids)
-    trunks = _placed(source[trunk_rows], target_from_source)
-    tree, others = cKDTree(trunks), _rivals(source, given, trunks, target_from_source, reach_m) if rivals else None
-    lower, upper = trunks.min(axis=0) - reach_m, trunks.max(axis=0) + reach_m
-    for start in range(0, len(target), _CHUNK):
-        progress(start / len(target), "Carrying the labels")
-        part = target[start : start + _CHUNK]
-        rows = np.flatnonzero(((part >= lower) & (part <= upper)).all(axis=1))
-        distance, nearest = tree.query(part[rows], distance_upper_bound=reach_m, workers=N_WORKERS)
-        near = np.isfinite(distance)
-        rows, distance, nearest = rows[near], distance[near], nearest[near]
-        if others is not None and len(rows):
-            rival = others.query(part[rows], distance_upper_bound=reach_m, workers=N_WORKERS)[0]
-            won = distance <= rival + margin_m
-            rows, nearest = rows[won], nearest[won]
-        labels[start + rows] = given[trunk_rows[nearest]]
-    arrived = tuple(int(name) for name in np.unique(labels) if name)
-    return CarriedLabels(readonly(labels), arrived, tuple(name for name in ids if name not in arrived))
+def stems_together(source: Survey, target: Survey, target_from_source: Similarity, *, tolerance_m: float = 0.5) -> int:
+    """How many stems of the source stand on a stem of the target, one to one."""
+    if not len(source.xy_m) or not len(target.xy_m):
+        return 0
+    feet = np.asarray(target_from_source.apply(np.column_stack([source.xy_m, source.base_m])), np.float64)
+    distance = np.linalg.norm(feet[:, None, :2] - target.xy_m[None], axis=2)
+    apart = np.abs(feet[:, None, 2] - target.base_m[None])
+    rows, columns = linear_sum_assignment(np.where(apart < 2.0 * tolerance_m, distance, 1e3))
+    return int(((distance[rows, columns] <= tolerance_m) & (apart[rows, columns] < 2.0 * tolerance_m)).sum())
 
 
-def carried_trunks(
-    target_points: Float,
-    ground: GroundModel,
-    carried: CarriedLabels,
-    *,
-    settings: TrunkSettings = TrunkSettings(),  # noqa: B008 - frozen
-    progress: Progress = ignore_progress,
-) -> CarriedTrunks:
-    """The paper's chain on the points that carry a label, and which trunk of the source each result is."""
-    result = segment_trunks(
-        target_points, ground, settings=settings, candidates=np.asarray(carried.labels > 0), progress=progress
-    )
-    ids = []
-    for rows in result.point_sets:
-        names, counts = np.unique(carried.labels[rows], return_counts=True)
-        is_trunk = names > 0
-        # Expansion adds points without a label; among those with one the commonest is it.
-        ids.append(int(names[is_trunk][counts[is_trunk].argmax()]) if is_trunk.any() else 0)
-    return CarriedTrunks(result, tuple(ids))
+def scale_error_of_surfaces(source: Survey, target: Survey, alignment: Alignment, *, n_sectors: int = 5) -> float:
+    """Standard error of a refined scale, as a share of it: by the jackknife over sectors of the plot."""
+    middle = np.median(source.firm[:, :2], axis=0)
+    away = source.firm[:, :2] - middle
+    sector = ((np.arctan2(away[:, 1], away[:, 0]) / (2.0 * np.pi) + 0.5) * n_sectors).astype(int) % n_sectors
+    reach = (_LAST_REACH_M, _LAST_REACH_M)
+    logs = []
+    for number in range(n_sectors):
+        rest = source.firm[sector != number]
+        if len(rest) >= 10:
+            fit = refine(rest, target.firm, alignment.target_from_source, with_scale=True, reach_m=reach, steps=6)
+            logs.append(np.log(fit.target_from_source.scale))
+    if len(logs) < 3:
+        return float("nan")
+    spread = np.array(logs) - np.mean(logs)
+    return float(np.sqrt((len(logs) - 1) / len(logs) * (spread**2).sum()))
 
 
 def _upright(match: StemMatch, source: Survey, target: Survey) -> Similarity:
@@ -356,24 +381,3 @@ def _ground_points(points: Float, ground: GroundModel) -> Float64:
 
 def _thinned(points: Float, edge_m: float = _FIRM_EDGE_M) -> Float64:
     return thin(points, edge_m).points.astype(np.float64)
-
-
-def _placed(points: Float, target_from_source: Similarity) -> Float64:
-    return np.asarray(target_from_source.apply(points.astype(np.float64)), np.float64)
-
-
-def _rivals(
-    source: Float, labels: Int32, trunks: Float64, target_from_source: Similarity, reach_m: float
-) -> cKDTree | None:
-    """A tree of the points without a label near trunks; None where there are none."""
-    tree = cKDTree(trunks)
-    lower, upper = trunks.min(axis=0) - 2.0 * reach_m, trunks.max(axis=0) + 2.0 * reach_m
-    found = []
-    for start in range(0, len(source), _CHUNK):
-        rows = start + np.flatnonzero(labels[start : start + _CHUNK] == 0)
-        part = _placed(source[rows], target_from_source)
-        part = part[((part >= lower) & (part <= upper)).all(axis=1)]
-        near = np.isfinite(tree.query(part, distance_upper_bound=2.0 * reach_m, workers=N_WORKERS)[0])
-        found.append(part[near])
-    points = np.concatenate(found) if found else np.empty((0, 3))
-    return cKDTree(points) if len(points) else None

@@ -28,6 +28,7 @@ SOURCES: Mapping[ScaleSource, str] = {
     "bars": "measured on known lengths",
     "camera_height": "from the height the camera was carried at",
     "baseline": "from the distance between two photos",
+    "lidar": "from the LiDAR cloud of the same plot",
 }
 WAYS: Mapping[str, tuple[str, str]] = {
     "markers": ("Markers", "Find printed markers in the photos by themselves"),

@@ -8,7 +8,10 @@ from dbh_studio.core.dbh import DbhEstimate
 from dbh_studio.errors import StudioError
 from dbh_studio.io.inventory_csv import inventory_csv
 from dbh_studio.ui import html
+from dbh_studio.ui.evaluation_section import EvaluationSection
+from dbh_studio.ui.export_section import ExportSection
 from dbh_studio.ui.panels.base import Panel, set_content
+from dbh_studio.ui.transfer_section import TransferSection
 
 
 class ExportPanel(Panel):
@@ -21,9 +24,20 @@ class ExportPanel(Panel):
         self._state = self.gui.add_html("")
         button = self.gui.add_button("Download the inventory (CSV)", icon=viser.Icon.DOWNLOAD, color="green")
         self.tab.worker.on_click(button, self._export)
+        self._files = ExportSection(self.tab)
+        self._evaluation = EvaluationSection(self.tab)
+        self._transfer = TransferSection(self.tab)
+
+    def set_busy(self, busy: bool) -> None:
+        """One job at a time."""
+        self._files.set_busy(busy)
+        self._transfer.set_busy(busy)
 
     def refresh(self) -> None:
         """Say what will be in the file."""
+        self._files.refresh()
+        self._evaluation.refresh()
+        self._transfer.refresh()
         session = self.tab.session
         if session is None or not len(session.document.trunks):
             set_content(self._state, html.message("There is nothing to export yet: find the trunks first."))
