@@ -27,8 +27,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "ui"), str(ROOT)]
 
 import browser  # noqa: E402
+import mask_plots  # noqa: E402
 import scale_plots  # noqa: E402
 
+from dbh_studio.app.commands import change_settings  # noqa: E402
 from dbh_studio.app.demo import demo_plot  # noqa: E402
 from dbh_studio.app.doctor import find_chromium  # noqa: E402
 from dbh_studio.core.cloud import PointCloud  # noqa: E402
@@ -43,6 +45,7 @@ LARGEST_BYTES = 250_000
 PATIENCE_S = 300.0
 PANEL = "the panel"
 OF_SCALE = ("scale", "corners", "photos", "markers")
+OF_MASKS = ("masks", "label-count")
 # White, the three curves, the ring, the marks of good, fair, poor and refused, the bars of the hints.
 KEPT = [ImageColor.getrgb(c) for c in (
     "#ffffff", "#d9480f", "#0b7285", "#a61e8c", "#143cbe", "#2b8a3e", "#e8890c", "#c92a2a", "#868e96", "#f59f00",
@@ -236,6 +239,47 @@ def click_in_photo(camera: Photographer, point: np.ndarray) -> None:
     camera.settle(1.0)
 
 
+def of_masks(camera: Photographer, folder: Path) -> None:
+    """Masks that were brought, one of them being painted, and what they say of the cloud."""
+    page, studio = camera.page, camera.studio
+    plot = mask_plots.write_forest(folder / "masks_plot")
+    studio.adopt(mask_plots.open_session(plot, folder / "masks_plot.dbh"))
+    camera.settle()
+    camera.step("trunks")
+    page.get_by_text("Bring masks").first.click()
+    camera.show_text("Masks in", str(plot.masks))
+    page.get_by_role("button", name="Look at them", exact=True).click()
+    page.get_by_role("button", name="Use these masks", exact=True).click()
+    page.get_by_role("button", name="Look through the masks", exact=True).click()
+    page.wait_for_selector("#dbh-photo .view[data-frame]")
+    page.click("[data-photo=large]")
+    camera.settle()
+    tab, name = camera.tab, "01.jpg"
+    tab.worker.post(lambda: tab.photos.open(name, at_px=(400.0, 256.0), zoom_px=4.0))
+    camera.settle()
+    page.click("[data-mask=paint]")
+    page.click("[data-mask=erase]")
+    page.locator("[data-mask=size]").fill("26")
+    (x, y), _ = (np.asarray(part)[0] for part in tab.photos._look.view_from_photo([(324.0, 250.0)]))
+    box = page.locator("#dbh-photo .view").bounding_box()
+    page.mouse.move(box["x"] + x, box["y"] + y - 60)
+    page.mouse.down()
+    page.mouse.move(box["x"] + x, box["y"] + y, steps=12)
+    page.mouse.up()
+    camera.settle()
+    camera.show_text("Masks in", "plots/masks")
+    page.mouse.move(box["x"] + x, box["y"] + y)
+    camera.take("masks")
+    page.click("[data-mask=done]")
+    page.click("[data-photo=close]")
+    page.get_by_role("button", name="Find trunks from the masks", exact=True).click()
+    camera.until(lambda: studio.session is not None and len(studio.session.document.trunks))
+    camera.settle()
+    page.click("#dbh-view button[data-mode='Label count']")
+    camera.settle(5.0)
+    camera.take("label-count")
+
+
 def tour(camera: Photographer, folder: Path) -> None:
     """The way of one plot from opening to export, as the guide tells it."""
     page, studio = camera.page, camera.studio
@@ -243,7 +287,9 @@ def tour(camera: Photographer, folder: Path) -> None:
     shutil.copyfile(demo_plot().path, demo)
     if not camera.wanted or set(camera.wanted) & set(OF_SCALE):
         of_scale(camera, folder)
-    if camera.wanted and set(camera.wanted) <= set(OF_SCALE):
+    if not camera.wanted or set(camera.wanted) & set(OF_MASKS):
+        of_masks(camera, folder)
+    if camera.wanted and set(camera.wanted) <= {*OF_SCALE, *OF_MASKS}:
         return
     if not camera.wanted or "data-check-unscaled" in camera.wanted:
         camera.open(unscaled(demo, folder))
@@ -278,6 +324,24 @@ def tour(camera: Photographer, folder: Path) -> None:
     page.click("#dbh-view button[data-mode='Segmentation (by tree)']")
     camera.step("export")
     camera.take("export")
+    if not camera.wanted or "steps" in camera.wanted:
+        lost_trees(camera)
+
+
+def lost_trees(camera: Photographer) -> None:
+    """What the paper's rule loses, in the colours of the steps."""
+    page, session = camera.page, camera.studio.session
+    assert session is not None
+    session.do(change_settings("trunks", small_clusters="otsu"))
+    camera.step("trunks")
+    page.get_by_role("button", name="Find trunks", exact=True).click()
+    camera.until(lambda: session.last_search and session.last_search.steps.settings.small_clusters == "otsu")
+    camera.settle()
+    page.click("#dbh-view button[data-mode=Steps]")
+    page.get_by_text("Where trees were lost").click()
+    page.locator("[data-go]").first.click()
+    camera.settle(5.0)
+    camera.take("steps")
 
 
 @contextlib.contextmanager

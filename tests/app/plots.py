@@ -57,7 +57,7 @@ class CountingStages:
         self.n_grounds += 1
         return FlatGround()
 
-    def measure_trunk(self, points_world, *, trunk_id, ground, settings):
+    def measure_trunk(self, points_world, *, trunk_id, ground, settings, scale_sd=0.0):
         self.measured.append(trunk_id)
         mean = points_world.mean(axis=0).astype(np.float64)
         result = Refusal("too_few_points", f"{settings.curve} {mean[0]:.6f}", "Walk closer.")

@@ -239,7 +239,8 @@ def test_the_files_own_tree_ids_are_taken_over_unless_told_otherwise(tmp_path):
 def test_ids_too_large_for_a_trunk_are_numbered_anew():
     points, ids = stems_and_ground()
     large = np.where(ids > 0, ids.astype(np.int64) + 2**40, 0)
-    _, trunks, notes = segment_plot(points.astype(np.float32), Settings(), large)
+    found = segment_plot(points.astype(np.float32), Settings(), large)
+    trunks, notes = found.trunks, found.notes
     assert trunks.ids == (1, 2, 3) and any("anew" in note for note in notes)
 
 
@@ -317,14 +318,14 @@ def test_trunks_are_never_put_on_another_cloud(las, tmp_path):
     session = open_plot(las, project_dir=folder)
     segment(session, in_process=True)
     session.close()
-    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"}
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"}
     cloud = make_cloud()
     for other in (cloud.subset(np.arange(len(cloud))[::-1]), cloud.subset(np.arange(len(cloud) - 1))):
         write_las(las, other)
         with pytest.raises(ProjectError, match="not the cloud") as caught:
             open_plot(folder)
         assert caught.value.remedy
-    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "lock"} == before
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "lock"} == before
     write_las(las, cloud)
     open_plot(folder).close()
 
@@ -358,7 +359,7 @@ def test_save_as_leaves_the_old_plot_and_does_not_overwrite(las, tmp_path):
     session = open_plot(las)
     with pytest.raises(ProjectError, match="already"):
         save_as(session, tmp_path / "b.dbh")
-    assert json.loads((tmp_path / "b.dbh" / "project.json").read_text())["schema_version"] == 1
+    assert json.loads((tmp_path / "b.dbh" / "project.json").read_text())["schema_version"] == 2
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from hypothesis.extra import numpy as hnp
 from dbh_studio.errors import FileError, UnsupportedFormatError
 from dbh_studio.io.masks import MaskRecipe, MaskStore, TrunkMask
 from dbh_studio.io.masks import store as store_module
+from dbh_studio.io.masks.store import read_stored
 
 RECIPE = MaskRecipe("grounded_sam", {"detector": "ab" * 32}, "tree trunk", {"box": 0.3})
 
@@ -176,7 +177,7 @@ from dbh_studio.io.masks import MaskRecipe, MaskStore, TrunkMask
 folder = Path(sys.argv[1])
 store = MaskStore(folder / "m")
 recipe = MaskRecipe("test")
-photos = {f"{i}": folder / "a.jpg" for i in range(400)}
+photos = {f"{i}": folder / "a.jpg" for i in range(4000)}
 labels = np.random.default_rng(0).integers(0, 2, (300, 300)).astype(np.uint16)
 for name in store.to_do(photos, recipe):
     store.put(name, photos[name], TrunkMask(labels), recipe)
@@ -200,7 +201,7 @@ def test_a_killed_job_goes_on_where_it_was(tmp_path):
         # All that was told as done is done, and at most the one under way is done besides.
         assert all(store.get(name, tmp_path / "a.jpg", MaskRecipe("test")) is not None for name in told)
         assert len(told) <= len(store) <= len(told) + 2
-    assert len(set(told)) == len(told) < 400
+    assert len(set(told)) == len(told) < 4000
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
@@ -247,3 +248,42 @@ def test_superseded_lines_are_dropped_in_time(tmp_path, monkeypatch):
         store.put("a", path, trunks(), RECIPE)
     assert MaskStore(tmp_path / "m").get("a", path, RECIPE) is not None
     assert len((tmp_path / "m" / "index.jsonl").read_text().splitlines()) == 2
+
+
+def test_one_store_takes_the_masks_of_another(tmp_path):
+    here, there = MaskStore(tmp_path / "here"), MaskStore(tmp_path / "there")
+    paths = {name: photo(tmp_path, name) for name in ("a.jpg", "b.jpg", "c.jpg")}
+    here.put("a.jpg", paths["a.jpg"], trunks(1), RECIPE)
+    here.put("c.jpg", paths["c.jpg"], trunks(1), RECIPE)
+    there.put("a.jpg", paths["a.jpg"], trunks(3), RECIPE, review="accepted")
+    lost = there.put("b.jpg", paths["b.jpg"], trunks(2), RECIPE)
+    there.put("d.jpg", paths["b.jpg"], trunks(2), RECIPE)
+    (tmp_path / "there" / lost.file).unlink()
+    here.take(there)
+    again = MaskStore(tmp_path / "here")
+    # Of a photo that both have, the other's; what has lost its picture is made anew.
+    assert [entry.image for entry in again.entries] == ["c.jpg", "a.jpg", "d.jpg"]
+    assert same(again.get("a.jpg"), trunks(3)) and again.entry("a.jpg").review == "accepted"
+    assert len(there) == 3
+
+
+def test_whether_a_mask_is_of_a_photo_as_it_is_now(tmp_path):
+    store, path = MaskStore(tmp_path / "masks"), photo(tmp_path)
+    store.put("a.jpg", path, trunks(), RECIPE)
+    assert store.is_of("a.jpg", path) and store.is_of("a.jpg", str(path)) and store.is_of("a.jpg", None)
+    assert not store.is_of("b.jpg", path)
+    path.write_bytes(b"other pixels")
+    assert not store.is_of("a.jpg", path) and store.is_of("a.jpg", None)
+
+
+def test_a_stored_mask_is_read_without_its_store_and_a_damaged_one_is_told(tmp_path):
+    store = MaskStore(tmp_path / "masks")
+    entry = store.put("a.jpg", photo(tmp_path), trunks(), RECIPE)
+    assert same(read_stored(store.folder, entry), trunks())
+    picture = store.folder / entry.file
+    picture.write_bytes(picture.read_bytes()[:-8])
+    with pytest.raises(FileError, match="masks make"):
+        read_stored(store.folder, entry)
+    picture.unlink()
+    with pytest.raises(FileError, match=entry.file[:-4]):
+        read_stored(store.folder, entry)

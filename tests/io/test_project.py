@@ -18,6 +18,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from dbh_studio.core.inventory import TreeRecord
+from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectLockedError, ProjectVersionError
@@ -390,7 +391,7 @@ def test_a_damaged_plot_is_named_and_left_as_it_is(tmp_path, damage, words):
 
 def test_a_plot_of_a_newer_program_says_to_update(tmp_path):
     written(tmp_path / "plot.dbh", make_state(tmp_path))
-    _edited(schema_version=2, trunks="in a new way")(tmp_path / "plot.dbh")
+    _edited(schema_version=3, trunks="in a new way")(tmp_path / "plot.dbh")
     with pytest.raises(ProjectVersionError, match="newer") as caught:
         read_project(tmp_path / "plot.dbh")
     assert "Update" in caught.value.remedy
@@ -420,7 +421,26 @@ def test_schema_1_is_read_for_ever(tmp_path):
     assert state.trunks.ids == (1, 2) and state.trunks.next_id == 5
     assert state.trunks[2].points.tolist() == [2, 3] and state.trunks[2].origin == "hand"
     assert state.trees == {2: TreeRecord("oak", "dead")} and state.settings == Settings()
-    assert state.source_path == Path("/nowhere/plot.ply")
+    assert state.source_path == Path("/nowhere/plot.ply") and state.masks is None
+    # Saved again, it is a plot of today, with all that it was.
+    written(folder, state)
+    assert json.loads((folder / "project.json").read_text())["schema_version"] == 2
+    assert same(read_project(folder), state)
+
+
+def test_which_masks_the_trunks_came_from_is_kept_and_moves_along(tmp_path):
+    (tmp_path / "old" / "masks").mkdir(parents=True)
+    made = MaskRecord(
+        "made", "detector", 40, prompt="tree trunk", models=("a", "b"), recipe="0123456789abcdef", digest="00-11"
+    )
+    brought = MaskRecord(
+        "brought", "brought", 3, tmp_path / "old" / "masks", "labels", ("1-3", "7"), "same", digest="22-33"
+    )
+    for record in (made, brought):
+        written(tmp_path / "old" / "plot.dbh", replace(make_state(tmp_path / "old"), masks=record))
+        assert read_project(tmp_path / "old" / "plot.dbh").masks == record
+    shutil.move(tmp_path / "old", tmp_path / "new")
+    assert read_project(tmp_path / "new" / "plot.dbh").masks == replace(brought, path=tmp_path / "new" / "masks")
 
 
 def test_a_plot_moved_together_with_its_cloud_finds_it(tmp_path):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tests.stages.small_forest import STAND, Tree, forest, ground_z
 
+from dbh_studio.core.chain_steps import keep_clusters
 from dbh_studio.core.ground import StemBaseGround, fit_ground
 from dbh_studio.errors import CancelledError, SettingError
 from dbh_studio.settings import TrunkSettings
 from dbh_studio.stages.segment import SegmentationResult, segment_trunks
-from dbh_studio.stages.trunk_chain import keep_clusters
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 
@@ -152,10 +152,10 @@ def test_the_papers_otsu_drops_thin_stems_and_the_default_does_not() -> None:
 
 def test_rules_for_small_clusters() -> None:
     size, rings = np.array([9000.0, 400.0, 8000.0, 6.0, 11.0]), np.array([True, True, True, False, False])
-    assert keep_clusters(size, rings, "evidence")[0].tolist() == [True, True, True, False, False]
-    assert keep_clusters(size, rings, "otsu")[0].tolist() == [True, False, True, False, False]
-    assert keep_clusters(size, rings, "keep")[0].all()
-    assert keep_clusters(np.empty(0), np.empty(0, bool), "evidence")[0].shape == (0,)
+    assert keep_clusters(size, rings, TrunkSettings())[0].tolist() == [True, True, True, False, False]
+    assert keep_clusters(size, rings, TrunkSettings(small_clusters="otsu"))[0].tolist() == [True, False, True, False, False]
+    assert keep_clusters(size, rings, TrunkSettings(small_clusters="keep"))[0].all()
+    assert keep_clusters(np.empty(0), np.empty(0, bool), TrunkSettings())[0].shape == (0,)
 
 
 def test_masks_stand_in_for_the_detector() -> None:

@@ -39,6 +39,7 @@ def state_from_document(document: Document) -> PlotState:
         origin_src=document.origin_src,
         evidence=document.evidence,
         cameras=None if cameras is None else CameraPlace(cameras.path, cameras.images_dir, cameras.frame),
+        masks=document.masks,
     )
 
 
@@ -57,6 +58,7 @@ def document_from_state(state: PlotState, source: SourceInfo) -> Document:
         origin_src=state.origin_src,
         evidence=state.evidence,
         cameras=None if cameras is None else CameraSource(cameras.path, cameras.images_dir, cameras.frame),
+        masks=state.masks,
     )
 
 

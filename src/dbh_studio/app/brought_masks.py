@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,50 +12,22 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from dbh_studio.app.mask_overlay import spread, write_overlay
+from dbh_studio.app.mask_request import MaskRequest, VotingMasks
+from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.errors import FileError, FileMissingError, SettingError
-from dbh_studio.settings import VoteSettings
 
 if TYPE_CHECKING:
     from dbh_studio.core.mask_views import ImageMask
     from dbh_studio.core.posed_images import PosedImage, PosedImages
     from dbh_studio.io.masks import CocoMasks, MaskMatch, MaskMeaning, MaskPicture, TrunkMask
 
+__all__ = ["IGNORING", "MaskReader", "MaskRequest", "MaskSet", "VotingMasks", "find_brought_masks", "read_masks"]
+
 # Where more than this is trunk, most likely all classes of a picture, or the wrong side of a mask, were taken for it.
 _MOST_TRUNK = 0.5
 _LOSSY = frozenset({".jpg", ".jpeg", ".webp"})
 IGNORING: tuple[str, ...] = ("ignore_dark", "ignore_bright")
-
-
-@dataclass(frozen=True)
-class MaskRequest:
-    """Which masks, and what is known of them.
-
-    Attributes:
-        path: A folder, or a COCO file (``.json``), or one picture that is the mask of every photo.
-        meaning: See `io.masks.MEANINGS`; None takes what the masks look like, where that is clear.
-        style: How masks are named after photos: a key of `io.masks.MASK_STYLES`, or a template such as
-            ``{stem}_segm.png``; None takes the one that fits most photos.
-        categories: With numbered masks the numbers that are trunks (``7``, ``1-12``), of a COCO file the names or
-            ids of the categories; empty takes all numbers, or the categories that are trunks by their names.
-        votes: How masks become labels of points.
-        ignore_path: More masks, as `path` is; they only say where a photo says nothing (the walker, the sky).
-        ignore_side: Which side of these is to be ignored; ``dark`` as in masks for structure from motion.
-        cameras: The reconstruction with the poses; None looks where the cloud is, or takes those of the saved plot.
-        images_dir: Where the photos are; None beside the reconstruction. Only the overlay needs them.
-        overlay: JPEG file to write, one photo with its mask drawn.
-    """
-
-    path: Path
-    meaning: MaskMeaning | None = None
-    style: str | None = None
-    categories: tuple[str, ...] = ()
-    votes: VoteSettings = VoteSettings()  # noqa: RUF009 - frozen
-    ignore_path: Path | None = None
-    ignore_side: Literal["dark", "bright"] = "dark"
-    cameras: Path | None = None
-    images_dir: Path | None = None
-    overlay: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +63,38 @@ class MaskSet:
     def finds_trunks(self) -> bool:
         """Whether they say what is trunk, and not only what to ignore."""
         return self.meaning not in IGNORING
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The photos that have one."""
+        return tuple(self.match.found)
+
+    def where(self, name: str) -> Path:
+        """The file of a photo's mask."""
+        return self.match.found[name] if self.coco is None else self.path
+
+    def record(self) -> MaskRecord:
+        """What is saved with the trunks they find. A file that was changed changes its digest."""
+        digest = hashlib.sha256(repr((self.meaning, self.trunk_labels, self.ignore_side)).encode())
+        further = {} if self.ignore is None else self.ignore.found
+        # Outlines are all in one file; what stands for their pictures is no path.
+        files = [self.path] if self.coco is not None else [*self.match.found.values()]
+        for path in sorted({*files, *further.values()}):
+            try:
+                status = path.stat()
+                digest.update(f"{path}\t{status.st_size}\t{status.st_mtime_ns}\n".encode("utf-8", "replace"))
+            except OSError:
+                digest.update(f"{path}\n".encode("utf-8", "replace"))
+        return MaskRecord(
+            "brought",
+            "brought",
+            len(self.match.found),
+            path=self.path.absolute(),
+            meaning=self.meaning,
+            categories=_as_ranges(self.trunk_labels or ()),
+            style="" if self.coco is not None else self.match.style,
+            digest=digest.hexdigest()[:16],
+        )
 
     def mask(self, name: str) -> TrunkMask | None:
         """The mask of a photo, by the photo's name; None where it has none. What further masks ignore is in it.
@@ -133,7 +138,7 @@ class MaskReader:
         n_read: How many could be read.
     """
 
-    def __init__(self, masks: MaskSet, edge_px: int = 0) -> None:
+    def __init__(self, masks: VotingMasks, edge_px: int = 0) -> None:
         self.problems: dict[str, FileError] = {}
         self.n_read = 0
         self._masks = masks
@@ -153,7 +158,7 @@ class MaskReader:
             self.problems[photo.name] = error
             return None
         except ValueError as error:
-            self.problems[photo.name] = FileError(self._masks.match.found[photo.name], f"It does not fit ({error}).")
+            self.problems[photo.name] = FileError(self._masks.where(photo.name), f"It does not fit ({error}).")
             return None
         with self._lock:
             self.n_read += 1
@@ -339,6 +344,17 @@ def _numbers(wanted: Sequence[str]) -> tuple[int, ...]:
             ) from None
         numbers.update(range(low, high + 1))
     return tuple(sorted(numbers))
+
+
+def _as_ranges(numbers: Sequence[int]) -> tuple[str, ...]:
+    """1, 2, 3, 7 as ``1-3`` and ``7``, as `MaskRequest.categories` takes them."""
+    ranges: list[list[int]] = []
+    for number in sorted(numbers):
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1][1] = number
+        else:
+            ranges.append([number, number])
+    return tuple(f"{low}" if low == high else f"{low}-{high}" for low, high in ranges)
 
 
 def _with_ignored(masks: MaskSet, request: MaskRequest, posed: PosedImages) -> MaskSet:

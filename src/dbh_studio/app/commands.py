@@ -6,7 +6,7 @@ A command that cannot be applied raises `CommandError` and changes nothing.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dbh_studio.app.document import CameraSource, Direction, Document, unit_direction
 from dbh_studio.core.arrays import Int32
 from dbh_studio.core.inventory import TreeRecord, check_text
+from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.scale_evidence import MarkerSquare, ScaleBar, ScaleEvidence
 from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
@@ -191,20 +192,29 @@ def change_settings(section: str, **values: Any) -> Command:
     return Command(f"Change the {section} settings", apply)
 
 
-def replace_trunks(trunks: TrunkSet, *, label: str = "") -> Command:
-    """Put newly found trunks in place of all there are.
+def replace_trunks(
+    trunks: TrunkSet, *, label: str = "", masks: MaskRecord | None = None, flags: Mapping[int, str] | None = None
+) -> Command:
+    """Put newly found trunks in place of all there are, and note by which masks they were found; None: by none.
 
     A new trunk that is an old one found again keeps its id and what was said about it. One from the file keeps the
     file's number, unless that is the number of another trunk that is present. The others get new ids; but in a plot
-    that never had a trunk the given ids are kept.
+    that never had a trunk the given ids are kept. Flags of an earlier search go; `flags` (by the given ids) come.
     """
 
     def apply(document: Document) -> Document:
         _check_indices(trunks, document.source.n_points)
         numbered = trunks if document.trunks.next_id == 1 else _renumbered(trunks, document)
+        # By the first point: ids may be others now, and points belong to one trunk.
+        flag_at = {int(trunks[i].points[0]): text for i, text in (flags or {}).items()}
+        flag_of = {trunk.id: flag_at.get(int(trunk.points[0]), "") for trunk in numbered}
         # A record speaks of the stem; that its points were set by hand is no longer so.
-        trees = {i: replace(record, edited=False) for i, record in document.trees.items() if i in numbered}
-        return replace(document, trunks=numbered, trees=trees)
+        trees = {
+            i: replace(document.record(i), edited=False, flag=flag)
+            for i, flag in flag_of.items()
+            if flag or i in document.trees
+        }
+        return replace(document, trunks=numbered, trees=trees, masks=masks)
 
     return Command(label or f"Find {len(trunks)} trunks", apply)
 

@@ -14,6 +14,7 @@ import numpy as np
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import TREE_STATUSES, TreeRecord, TreeStatus
+from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.scale_evidence import ScaleEvidence
 from dbh_studio.core.transforms import UP_AXES, Similarity, rotation_to_z_up
@@ -151,6 +152,7 @@ class Document:
         origin_src: Where the world's origin is, source units from the cloud's origin.
         evidence: The known lengths the scale was, or may be, taken from.
         cameras: The photos; None where there are none.
+        masks: Which masks the trunks were found by; None where they came from the cloud alone, from a file or by hand.
     """
 
     plot_id: str
@@ -164,6 +166,7 @@ class Document:
     origin_src: Direction = (0.0, 0.0, 0.0)
     evidence: ScaleEvidence = ScaleEvidence()
     cameras: CameraSource | None = None
+    masks: MaskRecord | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "up_direction", unit_direction(self.up_direction))

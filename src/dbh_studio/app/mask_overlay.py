@@ -68,18 +68,32 @@ def write_overlay(path: Path, masks: MaskSet, posed: PosedImages) -> str:
         SettingError: It is no name of a JPEG file.
         OSError: It cannot be written.
     """
-    from PIL import Image
+    check_overlay_path(path)
+    name, picture = overlay_picture(masks, posed)
+    save_overlay(path, picture)
+    return name
 
-    from dbh_studio.io.atomic import atomic_file
 
+def check_overlay_path(path: Path) -> None:
+    """Raise SettingError or FileError where an overlay may not be written: no JPEG, or a file that is no overlay."""
     if path.suffix.lower() not in (".jpg", ".jpeg"):
         raise SettingError(f"{path.name}: the overlay is written as JPEG.", "Give it a name that ends in .jpg.")
     if os.path.lexists(path) and not _is_own_overlay(path):
         raise FileError(path, "There is such a file already, and it is no overlay.", "Choose another name for it.")
-    name, picture = overlay_picture(masks, posed)
+
+
+def save_overlay(path: Path, picture: UInt8) -> None:
+    """Write an (h, w, 3) overlay, marked as such, so that it may be replaced.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    from PIL import Image
+
+    from dbh_studio.io.atomic import atomic_file
+
     with atomic_file(path) as file:
         Image.fromarray(picture).save(file, "JPEG", quality=88, comment=_OWN_COMMENT)
-    return name
 
 
 def _is_own_overlay(path: Path) -> bool:

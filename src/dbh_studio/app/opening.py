@@ -9,9 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dbh_studio.app.autosave import Autosave, document_from_state
+from dbh_studio.app.candidates import keep_offers, kept_offers
 from dbh_studio.app.commands import set_scale, set_up
 from dbh_studio.app.document import Direction, Document, SourceInfo, unit_direction
+from dbh_studio.app.last_search import keep_search, kept_search
+from dbh_studio.app.plot_masks import MASKS_FOLDER, carry_masks, masks_folder
 from dbh_studio.app.session import Session, check_scale
+from dbh_studio.app.vote_cache import carry_votes, votes_folder
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
 from dbh_studio.core.transforms import UP_AXES
@@ -158,6 +162,7 @@ def save_as(
     folder = Path(folder)
     if not overwrite:
         _check_is_new(folder)
+    masks_before, votes_before = masks_folder(session), votes_folder(session)
     writer = ProjectWriter(folder)
     try:
         # Again, now that nobody else can write it: two processes may have come this far at once.
@@ -177,6 +182,10 @@ def save_as(
         raise ProjectError(problem)
     if before is not None:
         before.close()
+    carry_masks(masks_before, folder.absolute() / MASKS_FOLDER, move=before is None)
+    carry_votes(votes_before, folder.absolute() / "cache")
+    keep_search(folder, session)
+    keep_offers(folder, session)
     return saver
 
 
@@ -292,6 +301,9 @@ def _reopen(
         document = document_from_state(state, info)
         check = _check(reconstruction, _Wish(document.scale, document.up_direction))
         session = _session(reconstruction, document, check, read_only)
+        session.last_search = kept_search(folder, document)
+        session.read_from = folder.absolute() if read_only else None
+        session.offers = kept_offers(folder, document)
         if writer is not None:
             writer.adopt(state)
             # A new place is told to the saved plot at once: the next program may not be told.

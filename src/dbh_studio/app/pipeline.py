@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,11 @@ from numpy.typing import NDArray
 from dbh_studio.app.commands import change_settings, rename_plot, replace_trunks
 from dbh_studio.app.document import Direction, Document
 from dbh_studio.app.jobs import run_job
+from dbh_studio.app.last_search import apply_search
+from dbh_studio.app.mask_request import LadderRequest, MaskRequest
+from dbh_studio.app.names import file_name
 from dbh_studio.app.opening import open_plot, plot_name, read_cloud, save_as, scale_from
+from dbh_studio.app.plot_masks import MASKS_FOLDER, carry_masks, masks_folder
 from dbh_studio.app.session import Session
 from dbh_studio.app.threads import CallAhead, map_in_threads
 from dbh_studio.core.arrays import Float32
@@ -32,8 +35,9 @@ from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
 from dbh_studio.settings import GroundSettings, MeasureSettings, Settings
 
 if TYPE_CHECKING:
-    from dbh_studio.app.brought_masks import MaskRequest, MaskSet
+    from dbh_studio.app.brought_masks import MaskSet, VotingMasks
     from dbh_studio.app.photo_scale import PhotoRequest
+    from dbh_studio.core.chain_steps import ChainSteps
     from dbh_studio.core.ground import GroundModel
     from dbh_studio.core.reconstruction import Reconstruction
     from dbh_studio.stages.measure import StemMeasurement
@@ -41,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "SEGMENTATION_READS",
     "RunResult",
+    "Segmentation",
     "apply_segmentation",
     "measure_stems",
     "measurement_call",
@@ -66,10 +71,22 @@ SEGMENTATION_READS = (
     "trunks",
 )
 
-# Bytes. File systems allow 255, and what is written beside adds a suffix and a process number.
-_LONGEST_NAME = 180
 
-SegmentationResult = tuple["GroundModel", TrunkSet, tuple[str, ...]]
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What `segment_plot` found.
+
+    Attributes:
+        ground: The ground.
+        trunks: Numbered from west to east; those taken over keep the file's numbers.
+        notes: What the person should know, in plain words.
+        steps: What became of every point and every cluster; None where trees were taken over.
+    """
+
+    ground: GroundModel
+    trunks: TrunkSet
+    notes: tuple[str, ...]
+    steps: ChainSteps | None = None
 
 
 # ---- finding trunks
@@ -83,7 +100,7 @@ def segment_plot(
     candidates: NDArray[np.bool_] | None = None,
     ground: GroundModel | None = None,
     progress: Progress = ignore_progress,
-) -> SegmentationResult:
+) -> Segmentation:
     """Find the ground and the trunks. Pure and picklable, for a job.
 
     Args:
@@ -95,15 +112,14 @@ def segment_plot(
         progress: Called in between.
 
     Returns:
-        The ground, the trunks and notes in plain words. Trunks that were found are numbered from west to east; those
-        taken over keep the file's numbers.
+        The ground, the trunks and notes in plain words.
     """
     from dbh_studio.core.ground import fit_ground
 
     if ground is None:
         ground = fit_ground(points_world, settings=settings.ground, progress=subprogress(progress, 0.0, 0.4))
     notes = list(ground.notes)
-    trunks = TrunkSet()
+    trunks, steps = TrunkSet(), None
     if candidates is None and existing_ids is not None and settings.trunks.use_existing_ids:
         trunks, remarks = _trunks_from_ids(existing_ids, settings.measure.min_points)
         notes += remarks
@@ -120,8 +136,9 @@ def segment_plot(
         )
         trunks = TrunkSet.from_point_sets(_in_order(found.point_sets, points_world))
         notes += found.notes
+        steps = found.steps
     progress(1.0, "")
-    return ground, trunks, tuple(notes)
+    return Segmentation(ground, trunks, tuple(notes), steps)
 
 
 def _in_order(point_sets: Sequence[NDArray[Any]], points_world: Float32) -> list[NDArray[Any]]:
@@ -164,15 +181,15 @@ def segmentation_call(session: Session, document: Document) -> tuple[Float32, Se
     return session.points_world(document), document.settings, ids
 
 
-def apply_segmentation(session: Session, document: Document, result: SegmentationResult) -> None:
+def apply_segmentation(session: Session, document: Document, result: Segmentation) -> None:
     """Put the result of `segment_plot`, run for `document`, into the plot: one command.
 
     Raises:
         StaleResultError: What it was computed from has changed meanwhile.
     """
-    ground, trunks, _ = result
-    session.remember_ground(document, ground)
-    session.do(replace_trunks(trunks), based_on=document, reads=SEGMENTATION_READS)
+    session.remember_ground(document, result.ground)
+    command, n_trunks = replace_trunks(result.trunks), len(result.trunks)
+    apply_search(session, document, command, result.steps, n_trunks=n_trunks, reads=SEGMENTATION_READS)
 
 
 def segment(
@@ -185,13 +202,13 @@ def segment(
     """Find the trunks of a plot and wait for them; the notes. `ahead` may have begun with it, see `_read_and_begin`."""
     document = session.document
     call = segmentation_call(session, document)
-    result: SegmentationResult
+    result: Segmentation
     if ahead is not None:
         result = ahead.call(segment_plot, *call, progress=progress)
     else:
         result = run_job(segment_plot, *call, progress=progress, in_process=in_process)
     apply_segmentation(session, document, result)
-    return result[2]
+    return result.notes
 
 
 # ---- measuring
@@ -201,6 +218,7 @@ def measure_stems(
     stems: Sequence[tuple[int, Float32]],
     ground: GroundModel,
     settings: MeasureSettings,
+    scale_sd: float = 0.0,
     *,
     progress: Progress = ignore_progress,
 ) -> list[StemMeasurement]:
@@ -208,7 +226,7 @@ def measure_stems(
     from dbh_studio.stages.measure import measure_trunk
 
     def measure(stem: tuple[int, Float32]) -> StemMeasurement:
-        return measure_trunk(stem[1], trunk_id=stem[0], ground=ground, settings=settings)
+        return measure_trunk(stem[1], trunk_id=stem[0], ground=ground, settings=settings, scale_sd=scale_sd)
 
     measured: list[StemMeasurement] = []
     progress(0.0, "Measuring the stems")
@@ -238,7 +256,7 @@ def measurement_call(session: Session, document: Document) -> tuple[Any, ...]:
     """
     points_world = session.points_world(document)
     stems = [(i, points_world[document.trunks[i].points]) for i in session.unmeasured(document)]
-    return stems, session.ground(document=document), document.settings.measure
+    return stems, session.ground(document=document), document.settings.measure, document.scale.relative_sd
 
 
 # ---- all at once
@@ -271,7 +289,7 @@ def run_plot(
     up: str | Direction | None = None,
     settings: Settings | Mapping[str, Mapping[str, Any]] | None = None,
     photos: PhotoRequest | None = None,
-    masks: MaskRequest | None = None,
+    masks: MaskRequest | LadderRequest | None = None,
     plot_id: str = "",
     relocate: Path | str | None = None,
     overwrite: bool = False,
@@ -286,7 +304,8 @@ def run_plot(
         settings: Instead of the defaults, or of those the saved plot has; as section -> name -> value, only the named
             ones are changed.
         photos: Take the scale from markers in these photos.
-        masks: Find the trunks by these masks of the photos. Those a saved plot has are replaced, if `overwrite` allows.
+        masks: Find the trunks by these masks of the photos, or by the best that is there (`LadderRequest`). Those a
+            saved plot has are replaced, if `overwrite` allows.
         plot_id: What to call the plot; the file's name by default.
         relocate: Where the cloud of a saved plot is now.
         overwrite: Replace a plot that an earlier run left in `out_dir`, and ``NAME.csv``. Edits made in them are lost.
@@ -300,7 +319,7 @@ def run_plot(
         StudioError: What `open_plot` and the stages raise.
     """
     path, out_dir = Path(path), Path(out_dir)
-    name = _file_name(plot_id or plot_name(path))
+    name = file_name(plot_id or plot_name(path))
     is_saved = is_project(path)
     project_dir = path if is_saved else out_dir / f"{name}{FOLDER_SUFFIX}"
     if not is_saved and not overwrite and (project_dir / PROJECT_FILE).exists():
@@ -325,25 +344,33 @@ def run_plot(
         check_not_source(csv_path, session.document.source.used)
         _configure(session, settings, plot_id)
         notes = [*session.notes]
-        mask_set = None
+        mask_set: VotingMasks | None = None
         if masks is not None:
+            _check_replaceable_trunks(session, overwrite=overwrite)
+        if isinstance(masks, MaskRequest):
             # Before the markers are looked for, which takes minutes: a wrong path is told at once.
             if photos is None:
                 session.require_scale()
             with _timed(timings_s, "look at the masks"):
-                mask_set = _masks(session, masks, overwrite=overwrite, progress=progress)
+                mask_set = _masks(session, masks, progress=progress)
                 notes += mask_set.notes
         if photos is not None:
             with _timed(timings_s, "scale"):
                 notes += _scaled(session, photos, in_process=in_process, progress=progress)
         session.require_scale()
+        if isinstance(masks, LadderRequest):
+            with _timed(timings_s, "masks"):
+                kept_before = None if is_saved else project_dir
+                part = subprogress(progress, 0.3, 0.6)
+                mask_set, said = _by_ladder(session, masks, kept_before, in_process=in_process, progress=part)
+                notes += said
         if masks is not None and mask_set is not None:
             with _timed(timings_s, "ground, votes and trunks"):
-                part = subprogress(progress, 0.3, 0.7)
+                part = subprogress(progress, 0.6 if isinstance(masks, LadderRequest) else 0.3, 0.7)
                 notes += _by_masks(session, mask_set, masks, in_process=in_process, progress=part)
-        elif not len(session.document.trunks):
+        elif masks is not None or not len(session.document.trunks):
             with _timed(timings_s, "ground and trunks"):
-                part = subprogress(progress, 0.3, 0.7)
+                part = subprogress(progress, 0.6 if masks is not None else 0.3, 0.7)
                 notes += segment(session, progress=part, in_process=in_process, ahead=ahead)
         elif is_saved:
             notes.append(f"The trunks are those the plot was saved with ({len(session.document.trunks)}).")
@@ -374,24 +401,50 @@ def _scaled(session: Session, photos: PhotoRequest, *, in_process: bool, progres
     return [f"{verdict.message} {verdict.remedy}".strip()]
 
 
-def _masks(session: Session, request: MaskRequest, *, overwrite: bool, progress: Progress) -> MaskSet:
-    from dbh_studio.app.image_trunks import masks_of_plot
-
+def _check_replaceable_trunks(session: Session, *, overwrite: bool) -> None:
     if len(session.document.trunks) and not overwrite:
         raise CommandError(
             f"The saved plot has {len(session.document.trunks)} trunks already, perhaps with edits.",
             "Measure it without masks, or say that its trunks may be replaced (--overwrite).",
         )
+
+
+def _masks(session: Session, request: MaskRequest, *, progress: Progress) -> MaskSet:
+    from dbh_studio.app.image_trunks import masks_of_plot
+
     return masks_of_plot(session, request, progress=subprogress(progress, 0.3, 0.3))
 
 
+def _by_ladder(
+    session: Session, request: LadderRequest, kept_before: Path | None, *, in_process: bool, progress: Progress
+) -> tuple[VotingMasks | None, tuple[str, ...]]:
+    """Masks to vote with, None where geometry is to find the trunks; and what the person should know.
+
+    Those an earlier run left where this one will be saved are used again, as far as their photos are the same.
+    """
+    from dbh_studio.app.mask_run import take_ladder
+
+    if kept_before is not None:
+        carry_masks(kept_before / MASKS_FOLDER, masks_folder(session), move=False)
+    taken = take_ladder(session, request, in_process=in_process, progress=progress)
+    return taken.masks, taken.notes
+
+
 def _by_masks(
-    session: Session, masks: MaskSet, request: MaskRequest, *, in_process: bool, progress: Progress
+    session: Session, masks: VotingMasks, request: MaskRequest | LadderRequest, *, in_process: bool, progress: Progress
 ) -> tuple[str, ...]:
     """Find the trunks by masks; what the person should know of it."""
     from dbh_studio.app.image_trunks import trunks_from_masks
 
-    return trunks_from_masks(session, masks, request.votes, in_process=in_process, progress=progress).notes
+    found = trunks_from_masks(
+        session,
+        masks,
+        request.votes,
+        accept_candidates=request.accept_candidates,
+        in_process=in_process,
+        progress=progress,
+    )
+    return found.notes
 
 
 def _read_and_begin(ahead: CallAhead, path: Path, *, progress: Progress = ignore_progress) -> Reconstruction:
@@ -423,12 +476,6 @@ def _timed(timings_s: dict[str, float], step: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     timings_s[step] = time.perf_counter() - start
-
-
-def _file_name(plot_id: str) -> str:
-    """A plot's name as that of a file: portable, and short enough for what is put around it."""
-    name = re.sub(r'[\x00-\x1f\x7f\\/:*?"<>|]+', "_", plot_id).strip(". ")
-    return name.encode("utf-8", "replace")[:_LONGEST_NAME].decode("utf-8", "ignore").rstrip(". ") or "plot"
 
 
 def _check_table(csv_path: Path, path: Path, *, is_saved: bool, overwrite: bool) -> None:

@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,8 +25,11 @@ from dbh_studio.errors import CommandError, ProjectError, SettingError, StaleRes
 if TYPE_CHECKING:
     from dbh_studio.app.autosave import Autosave
     from dbh_studio.app.cameras import Cameras
+    from dbh_studio.app.candidates import Offers
+    from dbh_studio.app.last_search import LastSearch
     from dbh_studio.core.datacheck import DataCheck
     from dbh_studio.core.ground import GroundModel
+    from dbh_studio.core.stem_profile import ProfilePoint
     from dbh_studio.stages.measure import StemMeasurement
 
 _log = logging.getLogger(__name__)
@@ -49,6 +53,7 @@ _FIELDS = {
     "origin_src": "the plot's origin",
     "evidence": "the known lengths",
     "cameras": "the photos",
+    "masks": "the masks the trunks were found by",
 }
 _ALL_FIELDS = tuple(name for name in _FIELDS if "." not in name)
 
@@ -115,9 +120,15 @@ class Session:
         self.is_read_only = read_only
         self._is_geographic = is_geographic
         self.saver: Autosave | None = None
+        # The saved plot it was read from, where it is only read.
+        self.read_from: Path | None = None
         self._document = document
         self._derived = derived or Derived(cloud)
         self._cameras: Cameras | None = None
+        # How the trunks were found last; beside the Document, for it decides nothing.
+        self.last_search: LastSearch | None = None
+        # Stems that may be trunks; beside the Document, for they are none until somebody says so.
+        self.offers: Offers | None = None
         self._next_id = document.trunks.next_id
         self._past: deque[tuple[str, Document]] = deque(maxlen=history_limit)
         self._future: list[tuple[str, Document]] = []
@@ -316,6 +327,14 @@ class Session:
             KeyError: There is no such trunk.
         """
         return self._derived.measurement(document or self._document, trunk_id)
+
+    def compared(self, trunk_id: int, *, document: Document | None = None) -> StemMeasurement:
+        """As `measurement`, with every other method fitted beside the chosen one; not remembered."""
+        return self._derived.compared(document or self._document, trunk_id)
+
+    def profile(self, trunk_id: int, *, document: Document | None = None) -> tuple[ProfilePoint, ...]:
+        """Diameters every 10 cm along one stem, see `core.stem_profile`; not remembered."""
+        return self._derived.profile(document or self._document, trunk_id)
 
     def measurements(self, progress: Progress = ignore_progress) -> tuple[StemMeasurement, ...]:
         """All stems, in order of id."""

@@ -24,7 +24,7 @@ EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_UNSCALED, EXIT_INTERRUPTED, EXIT_TERMINATE
 _log = logging.getLogger(__name__)
 
 # Their value may begin with a minus, which argparse would take for the next option.
-_SIGNED_OPTIONS = ("--up", "--ground-z")
+_SIGNED_OPTIONS = ("--up", "--ground-z", "--lidar-up")
 
 
 class _TerminatedError(KeyboardInterrupt):
@@ -146,7 +146,7 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    from dbh_studio.cli import doctor, marker, measure, models, run, scale, studio
+    from dbh_studio.cli import doctor, evaluate, export, marker, masks, measure, models, run, scale, studio, transfer
 
     parser = argparse.ArgumentParser(
         prog="dbh-studio",
@@ -156,7 +156,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dbh-studio {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log what is done to standard error")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (studio, run, measure, scale, marker, models, doctor):
+    for module in (studio, run, measure, scale, evaluate, export, marker, masks, models, transfer, doctor):
         module.add_commands(commands)
     for command in commands.choices.values():
         # Also behind the command; without a default, which would undo the one in front of it.

@@ -43,7 +43,11 @@ def add_relocation_option(parser: argparse.ArgumentParser) -> None:
 
 def add_settings_options(parser: argparse.ArgumentParser, *, only_measure: bool = False) -> None:
     """The settings used most under their own names, and all of them (or those of measuring) by ``--set``."""
-    parser.add_argument("--curve", choices=("fourier", "ellipse", "bspline"), help="curve the diameter is read from")
+    parser.add_argument(
+        "--curve",
+        choices=("shrinkage", "circle", "fourier", "ellipse", "bspline"),
+        help="method the diameter is read by; shrinkage and circle give an interval",
+    )
     parser.add_argument("--breast-height", type=float, metavar="M", help="1.30, 1.37 (4.5 ft), 1.40 or another, metres")
     if not only_measure:
         parser.add_argument("--ground", choices=("terrain", "plane"), help="terrain, or the paper's single plane")
@@ -102,9 +106,10 @@ def add_mask_options(parser: argparse.ArgumentParser) -> None:
     masks.add_argument(
         "--masks",
         type=path_argument,
-        metavar="PATH",
-        help="folder with a mask for each photo, named after it, or a COCO file (.json); markers are then looked for "
-        "only where --marker-side, --marker or --dictionary is given",
+        metavar="PATH|auto|stored",
+        help="folder with a mask for each photo, named after it, or a COCO file (.json); auto: the best way to trunks "
+        "there is, making masks where models are here; stored: the masks kept beside the plot. Markers are then "
+        "looked for only where --marker-side, --marker or --dictionary is given",
     )
     masks.add_argument(
         "--mask-meaning",
@@ -147,6 +152,12 @@ def add_mask_options(parser: argparse.ArgumentParser) -> None:
         help="a point is trunk where one mask says so, also behind others, as in the paper; by default hidden points "
         "do not vote and masks must agree",
     )
+    masks.add_argument(
+        "--accept-candidates",
+        action="store_true",
+        help="take stems that geometry sees and the masks do not as trunks too, flagged; by default they are only "
+        "offered in the studio",
+    )
 
 
 def mask_request(options: argparse.Namespace) -> MaskRequest | None:
@@ -164,6 +175,7 @@ def mask_request(options: argparse.Namespace) -> MaskRequest | None:
             "--ignore-side": options.ignore_side,
             "--mask-overlay": options.mask_overlay,
             "--paper-votes": options.paper_votes,
+            "--accept-candidates": options.accept_candidates,
         }
         given = [name for name, value in about.items() if value]
         if given:
@@ -183,6 +195,7 @@ def mask_request(options: argparse.Namespace) -> MaskRequest | None:
         cameras=options.cameras,
         images_dir=options.images,
         overlay=options.mask_overlay,
+        accept_candidates=options.accept_candidates,
     )
 
 

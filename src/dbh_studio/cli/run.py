@@ -23,6 +23,7 @@ from dbh_studio.cli.common import (
     settings_changes,
     unscaled_error,
 )
+from dbh_studio.cli.mask_options import add_making_options, ladder_request
 from dbh_studio.errors import ProjectExistsError, ProjectLockedError, SettingError, UnscaledCloudError
 
 
@@ -47,11 +48,18 @@ def add_commands(commands: Any) -> None:
     add_settings_options(run)
     add_photo_options(run)
     add_mask_options(run)
+    add_making_options(run)
     run.add_argument("--name", default="", help="what to call the plot; the file's name by default")
     run.add_argument(
         "--overwrite",
         action="store_true",
         help="replace the saved plot and the table of an earlier run, and edits made in them",
+    )
+    run.add_argument(
+        "--steps",
+        type=path_argument,
+        metavar="FILE",
+        help="write what each step of the search kept and dropped, and why: .json, or .csv with a line per cluster",
     )
     run.add_argument("--json", action="store_true", help="print the result as JSON")
     run.add_argument("--quiet", action="store_true", help="no progress, no summary")
@@ -61,9 +69,13 @@ def add_commands(commands: Any) -> None:
 def run_plot(options: argparse.Namespace) -> int:
     """Run the whole chain."""
     from dbh_studio.app import pipeline
+    from dbh_studio.app.search_report import check_report, write_search_report
 
     changes = settings_changes(options)
-    photos, masks = photo_request(options), mask_request(options)
+    if options.steps is not None:
+        check_report(options.steps, overwrite=options.overwrite)
+    photos = photo_request(options)
+    masks = ladder_request(options) or mask_request(options)
     if photos is not None and options.scale is not None:
         raise SettingError("Both --scale and markers in photos were given.", "Leave one of them away.")
     try:
@@ -89,7 +101,11 @@ def run_plot(options: argparse.Namespace) -> int:
     except ProjectLockedError as error:
         raise ProjectLockedError(error.problem, "Close it there, or choose another --out.") from None
     inventory = result.session.inventory()
-    result.session.close()
+    try:
+        if options.steps is not None:
+            write_search_report(options.steps, result.session)
+    finally:
+        result.session.close()
     if options.json:
         print(json.dumps(_summary(result, inventory), indent=2))
     elif not options.quiet:

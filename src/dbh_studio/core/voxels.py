@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dbh_studio.core.arrays import Float, Float32, Int32, Int64, as_points
+
+Label = TypeVar("Label", bound=np.generic)
 
 # Along each axis: three such numbers make one 64-bit key.
 MAX_CUBES = 1 << 21
@@ -33,7 +37,7 @@ class Thinned:
     def __len__(self) -> int:
         return len(self.points)
 
-    def labels_of_points(self, labels: Int32) -> Int32:
+    def labels_of_points(self, labels: NDArray[Label]) -> NDArray[Label]:
         """(N,) label of every original point from (M,) labels of the cubes."""
         back = np.empty(len(self.order), labels.dtype)
         back[self.order] = np.repeat(labels, self.counts)

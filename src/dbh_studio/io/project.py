@@ -6,6 +6,7 @@
     history-1.jsonl the history of a plot that this one has replaced
     lock            held by the process that writes the plot
     cache/          may be deleted at any time
+    masks/          masks of the photos, see `io.masks.store`; not part of a save
 
 Each save writes a new trunks file (where trunks changed), then project.json in one step, then removes the old trunks.
 """
@@ -16,221 +17,57 @@ import contextlib
 import itertools
 import json
 import os
-import re
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import ValidationError
 
-from dbh_studio.core.inventory import TreeRecord, check_text
-from dbh_studio.core.scale import ScaleEstimate, ScaleSource
-from dbh_studio.core.scale_evidence import MarkedPoint, MarkerSquare, ScaleBar, ScaleEvidence, Sight
-from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
+from dbh_studio.core.inventory import TreeRecord
+from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.scale_evidence import ScaleEvidence
+from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectVersionError
 from dbh_studio.io.atomic import atomic_file
 from dbh_studio.io.lock import lock_file
 from dbh_studio.io.ownfile import open_own_file
-from dbh_studio.settings import Settings
+from dbh_studio.io.project_model import (
+    SCHEMA_VERSION,
+    TRUNKS_FILE,
+    CameraPlace,
+    PlotState,
+    SavedEvidence,
+    SavedProject,
+    camera_place,
+    locate,
+    migrated,
+    saved_project,
+)
 
-SCHEMA_VERSION = 1
+__all__ = [
+    "FOLDER_SUFFIX",
+    "HISTORY_FILE",
+    "LOCK_FILE",
+    "PROJECT_FILE",
+    "SCHEMA_VERSION",
+    "CameraPlace",
+    "PlotState",
+    "ProjectWriter",
+    "is_project",
+    "read_project",
+]
+
 FOLDER_SUFFIX = ".dbh"
 PROJECT_FILE = "project.json"
 HISTORY_FILE = "history.jsonl"
 LOCK_FILE = "lock"
 
-_TRUNKS_FILE = re.compile(r"trunks-(\d+)\.npz")
 _TRUNK_ARRAYS = ("ids", "ends", "points", "origins")
-_MAX_POINTS = 2**31 - 1  # trunks are int32 indices
 # How often a reader beside a busy writer looks again before it gives up.
 _N_LOOKS = 10
-
-
-def _check_text(text: str) -> str:
-    check_text("it", text)
-    return text
-
-
-Text = Annotated[str, AfterValidator(_check_text)]
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class SavedSource(_Model):
-    """Where the cloud is; `relative_path` is from the saved plot, so that both may be moved together."""
-
-    path: Text
-    relative_path: Text | None
-    used: tuple[Text, ...]
-    n_points: int = Field(ge=0, le=_MAX_POINTS)
-    fingerprint: Text
-
-
-class SavedScale(_Model):
-    """A `ScaleEstimate`."""
-
-    metres_per_unit: float = Field(gt=0)
-    source: ScaleSource
-    standard_error: float | None = Field(ge=0)
-
-
-class SavedTree(_Model):
-    """A `TreeRecord`."""
-
-    species: Text = ""
-    status: Literal["live", "dead", ""] = ""
-    note: Text = ""
-    tag: Text = ""
-    edited: bool = False
-    tree_id: int | None = Field(None, gt=0, le=MAX_TRUNK_ID)
-
-
-class SavedSight(_Model):
-    """A `Sight`."""
-
-    image: Text
-    u_px: float
-    v_px: float
-
-
-class SavedPoint(_Model):
-    """A `MarkedPoint`."""
-
-    xyz_src: tuple[float, float, float]
-    sigma_src: float = Field(0.0, ge=0)
-    sights: tuple[SavedSight, ...] = ()
-
-
-class SavedBar(_Model):
-    """A `ScaleBar`."""
-
-    name: Text
-    ends: tuple[SavedPoint, SavedPoint]
-    length_m: float = Field(gt=0)
-    length_se_m: float = Field(ge=0)
-    role: Literal["control", "check"]
-
-
-class SavedSquare(_Model):
-    """A `MarkerSquare`."""
-
-    name: Text
-    corners: tuple[SavedPoint, SavedPoint, SavedPoint, SavedPoint]
-    side_m: float = Field(gt=0)
-    side_se_m: float = Field(ge=0)
-    role: Literal["control", "check"]
-    marker: tuple[Text, int] | None = None
-    n_views: int | None = Field(None, ge=0)
-    side_sigma_src: float | None = Field(None, ge=0)
-    systematic_src: float = Field(0.0, ge=0)
-
-
-class SavedEvidence(_Model):
-    """A `ScaleEvidence`."""
-
-    bars: tuple[SavedBar, ...] = ()
-    squares: tuple[SavedSquare, ...] = ()
-    struck: tuple[tuple[Text, Text, int], ...] = ()
-
-    @classmethod
-    def of(cls, evidence: ScaleEvidence) -> SavedEvidence:
-        """What is saved of it."""
-        return cls.model_validate(asdict(evidence))
-
-    def evidence(self) -> ScaleEvidence:
-        """What was saved. Raises ValueError where it contradicts itself."""
-        bars = tuple(
-            ScaleBar(bar.name, _points(bar.ends), bar.length_m, bar.length_se_m, bar.role)  # type: ignore[arg-type]
-            for bar in self.bars
-        )
-        squares = tuple(
-            MarkerSquare(**(square.model_dump(exclude={"corners"}) | {"corners": _points(square.corners)}))
-            for square in self.squares
-        )
-        return ScaleEvidence(bars, squares, self.struck)
-
-
-def _points(saved: Iterable[SavedPoint]) -> tuple[MarkedPoint, ...]:
-    return tuple(
-        MarkedPoint(point.xyz_src, point.sigma_src, tuple(Sight(**sight.model_dump()) for sight in point.sights))
-        for point in saved
-    )
-
-
-class SavedCameras(_Model):
-    """Where the photos are; relative paths as of `SavedSource`."""
-
-    path: Text
-    relative_path: Text | None = None
-    images_dir: Text | None = None
-    relative_images_dir: Text | None = None
-    frame: Literal["cloud", "file"] = "cloud"
-
-
-class SavedProject(_Model):
-    """project.json, schema version 1."""
-
-    schema_version: Literal[1] = 1
-    plot_id: Text
-    source: SavedSource
-    up_direction: tuple[float, float, float]
-    scale: SavedScale
-    settings: Settings
-    trunks_file: str = Field(pattern=f"^{_TRUNKS_FILE.pattern}$")
-    next_id: int = Field(ge=1, le=MAX_TRUNK_ID + 1)
-    trees: dict[int, SavedTree]
-    north_direction: tuple[float, float, float] | None = None
-    origin_src: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    evidence: SavedEvidence = SavedEvidence()
-    cameras: SavedCameras | None = None
-
-    @field_validator("up_direction", "north_direction")
-    @classmethod
-    def _is_unit(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if up is not None and abs(sum(part * part for part in up) - 1) > 1e-6:
-            raise ValueError("is not of length 1")
-        return up
-
-
-@dataclass(frozen=True)
-class CameraPlace:
-    """Where the photos of a plot are: the reconstruction, the photos, and how the poses come to the cloud."""
-
-    path: Path
-    images_dir: Path | None
-    frame: Literal["cloud", "file"]
-
-
-@dataclass(frozen=True, eq=False)
-class PlotState:
-    """What a saved plot holds, in the program's own types.
-
-    Attributes:
-        source_path: Where the cloud is, absolute: beside the plot as it was saved, or else where it was then.
-        other_source_path: Where it was then, if there is a file of its name at both places; only one is the cloud.
-    """
-
-    plot_id: str
-    source_path: Path
-    source_used: tuple[Path, ...]
-    n_points: int
-    fingerprint: str
-    up_direction: tuple[float, float, float]
-    scale: ScaleEstimate
-    settings: Settings
-    trunks: TrunkSet
-    trees: Mapping[int, TreeRecord]
-    other_source_path: Path | None = None
-    north_direction: tuple[float, float, float] | None = None
-    origin_src: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    evidence: ScaleEvidence = ScaleEvidence()
-    cameras: CameraPlace | None = None
 
 
 def is_project(path: Path | str) -> bool:
@@ -257,7 +94,7 @@ def read_project(folder: Path | str) -> PlotState:
     strangers = sorted(set(saved.trees) - set(trunks.ids))
     if strangers:
         raise _damaged(folder / PROJECT_FILE, f"it describes trees {strangers} that have no trunk")
-    source_path, other_source_path = _locate(folder, saved.source)
+    source_path, other_source_path = locate(folder, saved.source)
     return PlotState(
         plot_id=saved.plot_id,
         source_path=source_path,
@@ -273,7 +110,8 @@ def read_project(folder: Path | str) -> PlotState:
         north_direction=saved.north_direction,
         origin_src=saved.origin_src,
         evidence=_evidence(folder, saved.evidence),
-        cameras=None if saved.cameras is None else _camera_place(folder, saved.cameras),
+        cameras=None if saved.cameras is None else camera_place(folder, saved.cameras),
+        masks=None if saved.masks is None else saved.masks.record(folder),
     )
 
 
@@ -282,19 +120,6 @@ def _evidence(folder: Path, saved: SavedEvidence) -> ScaleEvidence:
         return saved.evidence()
     except ValueError as error:
         raise _damaged(folder / PROJECT_FILE, f"evidence: {error}") from None
-
-
-def _camera_place(folder: Path, saved: SavedCameras) -> CameraPlace:
-    path = _there(folder, saved.path, saved.relative_path)
-    images = None if saved.images_dir is None else _there(folder, saved.images_dir, saved.relative_images_dir)
-    return CameraPlace(path, images, saved.frame)
-
-
-def _there(folder: Path, before: str, relative: str | None) -> Path:
-    """Beside the saved plot if there is such a file, else where it was."""
-    beside = None if relative is None else Path(os.path.normpath(folder / relative))
-    # os.path, not pathlib: that one raises where a folder may not be entered.
-    return beside if beside is not None and os.path.exists(beside) else Path(before)  # noqa: PTH110
 
 
 def _read_whole(folder: Path) -> tuple[SavedProject, TrunkSet]:
@@ -328,7 +153,7 @@ def _parse(path: Path) -> SavedProject:
             "Update DBH Studio to open it.",
         )
     try:
-        return SavedProject.model_validate(content)
+        return SavedProject.model_validate(migrated(content))
     except ValidationError as error:
         first = error.errors()[0]
         raise _damaged(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
@@ -339,18 +164,6 @@ def _damaged(path: Path, problem: str) -> ProjectError:
         f"{path.name} in {path.parent.name} is damaged ({problem}).",
         "Nothing was changed. Restore the folder from a backup, or open the cloud itself to begin anew.",
     )
-
-
-def _locate(folder: Path, source: SavedSource) -> tuple[Path, Path | None]:
-    """The source beside the plot if there is such a file, else where it was; and the other, if both are there."""
-    before = Path(source.path)
-    if source.relative_path is None:
-        return before, None
-    beside = Path(os.path.normpath(folder / source.relative_path))
-    # os.path, not pathlib: that one raises where a folder may not be entered.
-    if not os.path.exists(beside):  # noqa: PTH110
-        return before, None
-    return beside, before if before != beside and os.path.exists(before) else None  # noqa: PTH110
 
 
 def _read_trunks(path: Path, saved: SavedProject) -> TrunkSet:
@@ -455,7 +268,7 @@ class ProjectWriter:
             raise ValueError("the writer is closed")
         try:
             trunks_file = self._save_trunks(state.trunks)
-            content = _saved_project(state, self.folder, trunks_file, next_id).model_dump_json(indent=1).encode()
+            content = saved_project(state, self.folder, trunks_file, next_id).model_dump_json(indent=1).encode()
             with atomic_file(self.folder / PROJECT_FILE) as file:
                 file.write(content)
             _sync_folder(self.folder)
@@ -507,7 +320,7 @@ class ProjectWriter:
             self._lock = None
 
     def _trunk_files(self) -> Sequence[tuple[int, Path]]:
-        found = [(_TRUNKS_FILE.fullmatch(path.name), path) for path in self.folder.iterdir()]
+        found = [(TRUNKS_FILE.fullmatch(path.name), path) for path in self.folder.iterdir()]
         return [(int(match.group(1)), path) for match, path in found if match]
 
     def _save_trunks(self, trunks: TrunkSet) -> str:
@@ -562,47 +375,3 @@ def _write_trunks(file: IO[bytes], trunks: TrunkSet) -> None:
         points=np.concatenate([np.empty(0, np.int32), *points]),
         origins=np.array([trunk.origin for trunk in trunks], np.str_),
     )
-
-
-def _saved_project(state: PlotState, folder: Path, trunks_file: str, next_id: int) -> SavedProject:
-    scale = state.scale
-    return SavedProject(
-        plot_id=state.plot_id,
-        source=SavedSource(
-            path=str(state.source_path),
-            relative_path=_relative(state.source_path, folder),
-            used=tuple(str(path) for path in state.source_used),
-            n_points=state.n_points,
-            fingerprint=state.fingerprint,
-        ),
-        up_direction=state.up_direction,
-        scale=SavedScale(
-            metres_per_unit=scale.metres_per_unit, source=scale.source, standard_error=scale.standard_error
-        ),
-        settings=state.settings,
-        trunks_file=trunks_file,
-        next_id=max(state.trunks.next_id, next_id),
-        trees={i: SavedTree(**asdict(record)) for i, record in sorted(state.trees.items())},
-        north_direction=state.north_direction,
-        origin_src=state.origin_src,
-        evidence=SavedEvidence.of(state.evidence),
-        cameras=None if state.cameras is None else _saved_cameras(state.cameras, folder),
-    )
-
-
-def _saved_cameras(cameras: CameraPlace, folder: Path) -> SavedCameras:
-    images = cameras.images_dir
-    return SavedCameras(
-        path=str(cameras.path),
-        relative_path=_relative(cameras.path, folder),
-        images_dir=None if images is None else str(images),
-        relative_images_dir=None if images is None else _relative(images, folder),
-        frame=cameras.frame,
-    )
-
-
-def _relative(path: Path, folder: Path) -> str | None:
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # another drive, on Windows
-        return None

@@ -35,15 +35,26 @@ class GroundedSam:
 
     def recipe(self, settings: MaskDetectorSettings) -> MaskRecipe:
         """What masks made with these models and settings are stored under."""
-        options = settings.model_dump(mode="json", exclude={"prompt"})
-        if self.detector is None:
-            return MaskRecipe("prompted_sam", self.identities, "", options)
-        return MaskRecipe("grounded_sam", self.identities, settings.prompt, options)
+        return mask_recipe(self.identities, settings, prompted=self.detector is None)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the person should know of how the models run."""
         return (() if self.detector is None else self.detector.graph.notes) + self.segmenter.notes
+
+
+def mask_recipe(identities: dict[str, str], settings: MaskDetectorSettings, *, prompted: bool) -> MaskRecipe:
+    """What masks made with models of these identities are stored under; known before the models are opened.
+
+    Args:
+        identities: Model name → sha256 of its files.
+        settings: Prompt, thresholds, tiles.
+        prompted: Boxes come from trunks that geometry has found, not from a detector.
+    """
+    options = settings.model_dump(mode="json", exclude={"prompt"})
+    if prompted:
+        return MaskRecipe("prompted_sam", identities, "", options)
+    return MaskRecipe("grounded_sam", identities, settings.prompt, options)
 
 
 def rung(store: ModelStore) -> Rung:
@@ -82,12 +93,11 @@ def open_grounded_sam(
         MissingComponentError: onnxruntime is not there, or cannot do what is asked.
         CancelledError: From `progress`.
     """
-    names = [_chosen(store, "detector", detector, run)] if with_detector else []
-    names.append(_chosen(store, "segmenter", segmenter, run))
-    paths = []
-    for i, name in enumerate(names):
-        checking = subprogress(progress, 0.5 * i / len(names), 0.5 * (i + 1) / len(names))
-        paths.append(store.paths(name, progress=checking))
+    checking = subprogress(progress, 0.0, 0.5)
+    names = chosen_models(
+        store, run, detector=detector, segmenter=segmenter, with_detector=with_detector, progress=checking
+    )
+    paths = [store.paths(name) for name in names]
     found = None
     if with_detector:
         progress(0.5, f"Opening {names[0]}")
@@ -101,7 +111,30 @@ def open_grounded_sam(
     progress(0.9, f"Opening {names[-1]}")
     outlined = Sam.open(paths[-1], run)
     progress(1.0, "The models are ready.")
-    return GroundedSam(outlined, found, tuple(names), {name: store.identity(name) for name in names})
+    return GroundedSam(outlined, found, names, {name: store.identity(name) for name in names})
+
+
+def chosen_models(
+    store: ModelStore,
+    run: ModelRunSettings = ModelRunSettings(),  # noqa: B008 - frozen
+    *,
+    detector: str = "",
+    segmenter: str = "",
+    with_detector: bool = True,
+    progress: Progress = ignore_progress,
+) -> tuple[str, ...]:
+    """Names of the models `open_grounded_sam` would open, the detector first; their files are checked, not opened.
+
+    Raises:
+        ModelError: One is not there, or not what it should be.
+        MissingComponentError: onnxruntime is not there.
+        CancelledError: From `progress`.
+    """
+    names = [_chosen(store, "detector", detector, run)] if with_detector else []
+    names.append(_chosen(store, "segmenter", segmenter, run))
+    for i, name in enumerate(names):
+        store.paths(name, progress=subprogress(progress, i / len(names), (i + 1) / len(names)))
+    return tuple(names)
 
 
 def _chosen(store: ModelStore, purpose: str, name: str, run: ModelRunSettings) -> str:

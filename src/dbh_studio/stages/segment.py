@@ -19,15 +19,16 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64, as_points, readonly
+from dbh_studio.core.arrays import Bool, Float, Float32, Float64, Int32, Int64, UInt8, as_points, readonly
+from dbh_studio.core.chain_steps import ChainSteps, NearMiss, Step
 from dbh_studio.core.ground import GroundModel
 from dbh_studio.core.neighbours import N_WORKERS, point_spacing
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.voxels import MAX_CUBES, thin
 from dbh_studio.errors import SettingError
 from dbh_studio.settings import TrunkSettings
-from dbh_studio.stages.stem_detection import LAYER_M, Stem, detect_stems
-from dbh_studio.stages.trunk_chain import Chain, Cluster, Outcome
+from dbh_studio.stages.stem_detection import LAYER_M, Stem, search_stems
+from dbh_studio.stages.trunk_chain import Chain, Outcome
 
 _CHUNK = 1 << 20
 # More thinned points than this in the search slab are thinned further, so that large plots stay within memory and time.
@@ -44,35 +45,6 @@ NO_TRUNK_NOTE = (
 )
 
 
-@dataclass(frozen=True)
-class SegmentationSteps:
-    """How many points were left after each step, and what became of every cluster: where a tree was lost.
-
-    Attributes:
-        n_points: Of the cloud.
-        n_stems_detected: By the rings.
-        n_candidates: Points on a stem's surface, or in a mask.
-        n_above_ground: Of these, higher than the clearance.
-        n_facing_sideways: Of these, with a normal within the largest tilt of horizontal.
-        clusters: Largest first.
-        size_threshold: Otsu's, points; NaN where it was not asked.
-        n_in_clusters: Points of the clusters kept.
-        n_expanded: Points of all trunks in the end.
-        spacing_m: Typical distance between points on a surface.
-    """
-
-    n_points: int = 0
-    n_stems_detected: int = 0
-    n_candidates: int = 0
-    n_above_ground: int = 0
-    n_facing_sideways: int = 0
-    clusters: tuple[Cluster, ...] = ()
-    size_threshold: float = float("nan")
-    n_in_clusters: int = 0
-    n_expanded: int = 0
-    spacing_m: float = float("nan")
-
-
 @dataclass(frozen=True, eq=False)
 class SegmentationResult:
     """The trunks of a plot.
@@ -81,13 +53,13 @@ class SegmentationResult:
         point_sets: Per trunk the sorted indices into the cloud; disjoint, in order of x, then y.
         stems: What the detector saw of each, in the same order; None for a trunk that came from masks alone.
         notes: What the person should know, in plain words.
-        steps: Counts of every step.
+        steps: What became of every point and every cluster.
     """
 
     point_sets: tuple[Int32, ...]
     stems: tuple[Stem | None, ...]
     notes: tuple[str, ...]
-    steps: SegmentationSteps
+    steps: ChainSteps
 
 
 def segment_trunks(
@@ -125,30 +97,60 @@ def segment_trunks(
     height = _heights(points, ground, top_m, subprogress(progress, 0.0, 0.15))
     wanted = None if candidates is None else np.asarray(candidates, bool)
     slab, spacing = _slab(points, height, wanted, settings)
-    stems = detect_stems(
-        slab, spacing_m=spacing, settings=settings, progress=subprogress(progress, 0.2, 0.5), seed=seed
-    )
+    stems: tuple[Stem, ...] = ()
+    misses: tuple[NearMiss, ...] = ()
+    if wanted is None or settings.part_touching:
+        stems, misses = search_stems(
+            slab, spacing_m=spacing, settings=settings, progress=subprogress(progress, 0.2, 0.5), seed=seed
+        )
     # West to east, so that the numbering does not depend on which stem was surest.
     stems = tuple(sorted(stems, key=lambda stem: tuple(stem.xy_at(1.3))))
-    steps = SegmentationSteps(n_points=len(points), n_stems_detected=len(stems), spacing_m=spacing)
+    step = _steps_by_height(height, wanted, settings)
     rest = subprogress(progress, 0.5, 1.0)
-    if wanted is None:
-        rows = (
-            rows_in_column(points, height, *_footprint(stems, settings), settings) if stems else np.empty(0, np.int64)
-        )
-    else:
+    if wanted is not None:
         rows = np.flatnonzero(wanted)
-        n_candidates = len(rows)
         rows = rows[(height[rows] >= settings.ground_clearance_m) & (height[rows] < settings.trunk_top_m)]
-        steps = replace(steps, n_candidates=n_candidates, n_above_ground=len(rows))
+    elif stems:
+        rows = rows_in_column(points, height, *_footprint(stems, settings), settings)
+    else:
+        rows = np.empty(0, np.int64)
     rest(0.1, "Following the stems")
     chain = Chain(levelled(points, height, rows), stems, spacing, settings, subprogress(rest, 0.1, 0.8), seed)
     outcome = chain.of_stems() if wanted is None else chain.of_masks()
-    labels = outcome.labels
+    step[rows] = outcome.steps
+    all_rows, labels, joined_from = rows, outcome.labels, outcome.joined_from
     if wanted is not None and len(outcome.stems):
-        rows, labels = _expanded_beyond_masks(points, height, rows, labels, chain, settings)
+        all_rows, labels = _expanded_beyond_masks(points, height, rows, labels, chain, settings)
+        step[all_rows[len(rows) :]] = Step.JOINED
+        joined_from[Step.NO_CANDIDATE] += len(all_rows) - len(rows)
     rest(0.95, "Following the stems")
-    return _result(rows, labels, outcome, steps)
+    steps = ChainSteps(
+        labels=readonly(step),
+        dropped_cluster=readonly(outcome.details[outcome.steps == Step.DROPPED]),
+        tilt_deg=readonly(outcome.details[outcome.steps == Step.NOT_SIDEWAYS].astype(np.uint8)),
+        joined_from=tuple(int(n) for n in joined_from),
+        clusters=tuple(replace(cluster, point=int(rows[cluster.point])) for cluster in outcome.clusters),
+        size_threshold=outcome.size_threshold,
+        settings=settings,
+        from_masks=wanted is not None,
+        n_stems_detected=len(stems),
+        spacing_m=spacing,
+        near_misses=misses if wanted is None else (),
+    )
+    return _result(all_rows, labels, outcome, steps)
+
+
+def _steps_by_height(height: Float32, wanted: Bool | None, settings: TrunkSettings) -> UInt8:
+    """(N,) which points their height drops: all, or those in a mask. The others are no candidates until they are."""
+    step = np.full(len(height), Step.NO_CANDIDATE, np.uint8)
+    for start in range(0, len(height), _CHUNK):
+        part, own = height[start : start + _CHUNK], step[start : start + _CHUNK]
+        low, high = part < settings.ground_clearance_m, ~(part < settings.trunk_top_m)
+        if wanted is not None:
+            low &= wanted[start : start + _CHUNK]
+            high &= wanted[start : start + _CHUNK]
+        own[low], own[high] = Step.TOO_LOW, Step.TOO_HIGH
+    return step
 
 
 def levelled(points: Float, height: Float, rows: Int64) -> Float32:
@@ -267,7 +269,7 @@ def _expanded_beyond_masks(
     return np.concatenate([rows, around[near]]), np.concatenate([labels, kept_labels[nearest[near]]])
 
 
-def _result(rows: Int64, labels: Int32, outcome: Outcome, steps: SegmentationSteps) -> SegmentationResult:
+def _result(rows: Int64, labels: Int32, outcome: Outcome, steps: ChainSteps) -> SegmentationResult:
     """Sorted point sets in order of position, without empty ones."""
     inside = labels >= 0
     rows, labels = rows[inside], labels[inside]
@@ -275,16 +277,6 @@ def _result(rows: Int64, labels: Int32, outcome: Outcome, steps: SegmentationSte
     edges = np.searchsorted(labels[order], np.arange(len(outcome.stems) + 1))
     sets = [rows[order[a:b]].astype(np.int32) for a, b in pairwise(edges)]
     present = [k for k, points in enumerate(sets) if len(points)]
-    steps = replace(
-        steps,
-        n_candidates=steps.n_candidates or outcome.n_candidates,
-        n_above_ground=steps.n_above_ground or outcome.n_candidates,
-        n_facing_sideways=outcome.n_facing_sideways,
-        clusters=outcome.clusters,
-        size_threshold=outcome.size_threshold,
-        n_in_clusters=sum(cluster.n_points for cluster in outcome.clusters if cluster.kept),
-        n_expanded=len(rows),
-    )
     notes = () if present else (NO_TRUNK_NOTE,)
     return SegmentationResult(
         tuple(readonly(sets[k]) for k in present), tuple(outcome.stems[k] for k in present), notes, steps

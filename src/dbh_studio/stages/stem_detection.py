@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from dbh_studio.core.arrays import Float, Float64, Int32, Int64
+from dbh_studio.core.chain_steps import NearMiss
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.rings import Rings, find_rings
 from dbh_studio.settings import TrunkSettings
@@ -25,6 +26,8 @@ _WINDOW_M = 0.7
 _MIN_POINTS = 8
 # Layers with a clean ring, summed as shares. Measured: shrubs up to 1.2, real stems in noisy, sparse clouds from 3.1.
 _MIN_CLEAN_LAYERS = 2.0
+# Between the surfaces of a near miss and of a stem.
+_APART_M = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,10 @@ class Stem:
         return self.axis[0] + height_m * self.axis[1]
 
 
+# A stem, and the settings that speak against it.
+_Stack = tuple[Stem, tuple[str, ...]]
+
+
 def detect_stems(
     levelled: Float,
     *,
@@ -65,7 +72,19 @@ def detect_stems(
     progress: Progress = ignore_progress,
     seed: int = 0,
 ) -> tuple[Stem, ...]:
-    """Find the stems in a slab.
+    """The stems of `search_stems`."""
+    return search_stems(levelled, spacing_m=spacing_m, settings=settings, progress=progress, seed=seed)[0]
+
+
+def search_stems(
+    levelled: Float,
+    *,
+    spacing_m: float,
+    settings: TrunkSettings,
+    progress: Progress = ignore_progress,
+    seed: int = 0,
+) -> tuple[tuple[Stem, ...], tuple[NearMiss, ...]]:
+    """Find the stems in a slab, and what is none only because a setting asks for more.
 
     Args:
         levelled: (N, 3) thinned points of the slab: x, y, height above ground, metres.
@@ -75,14 +94,14 @@ def detect_stems(
         seed: Of the random samples.
 
     Returns:
-        Stems, surest first; none where nothing looks like one.
+        Stems, surest first, none where nothing looks like one; and near misses from west to east.
     """
     if len(levelled) < _MIN_POINTS:
-        return ()
+        return (), ()
     progress(0.0, "Looking for stems")
     rows, group, layer_of_group = _pieces(levelled, spacing_m, settings)
     if not len(rows):
-        return ()
+        return (), ()
     progress(0.3, "Looking for stems")
     rings = find_rings(
         levelled[rows, :2],
@@ -95,8 +114,9 @@ def detect_stems(
     layer = layer_of_group[rings.group]
     good = _looks_round(rings)
     rings, layer = rings.subset(good), layer[good]
-    stems = _stack(rings, layer, settings, subprogress(progress, 0.7, 1.0))
-    return _without_doubles(stems)
+    stacks = _stack(rings, layer, settings, subprogress(progress, 0.7, 1.0))
+    stems = _without_doubles([stem for stem, doubts in stacks if not doubts])
+    return stems, _near_misses([stack for stack in stacks if stack[1]], stems)
 
 
 def _pieces(levelled: Float, spacing_m: float, settings: TrunkSettings) -> tuple[Int64, Int32, Int32]:
@@ -164,7 +184,7 @@ def _looks_round(rings: Rings) -> np.ndarray:
     )
 
 
-def _stack(rings: Rings, layer: Int32, settings: TrunkSettings, progress: Progress) -> list[Stem]:
+def _stack(rings: Rings, layer: Int32, settings: TrunkSettings, progress: Progress) -> list[_Stack]:
     """Lines along which rings of similar radius stack up."""
     if len(rings) < 3:
         return []
@@ -181,7 +201,7 @@ def _stack(rings: Rings, layer: Int32, settings: TrunkSettings, progress: Progre
     stack = connected_components(graph, directed=False)[1]
     order = np.argsort(stack, kind="stable")
     stacks = np.split(order, np.flatnonzero(np.diff(stack[order])) + 1)
-    stems: list[Stem] = []
+    stems: list[_Stack] = []
     for k, rows in enumerate(stacks):
         if k % 50 == 0:
             progress(k / len(stacks), "Looking for stems")
@@ -189,16 +209,19 @@ def _stack(rings: Rings, layer: Int32, settings: TrunkSettings, progress: Progre
     return stems
 
 
-def _stems_in_stack(rings: Rings, height: Float64, settings: TrunkSettings) -> list[Stem]:
+def _stems_in_stack(rings: Rings, height: Float64, settings: TrunkSettings) -> list[_Stack]:
     """The best line through the rings' centres, then the best of what is left, while there is evidence for a stem."""
-    stems: list[Stem] = []
+    stems: list[_Stack] = []
     left = np.arange(len(rings))
     while len(np.unique(height[left])) >= 3:
         on = _best_line(rings.xy[left], rings.radius[left], height[left], rings.coverage_deg[left], settings)
-        stem = _as_stem(rings.subset(left[on]), height[left[on]], settings) if len(on) else None
-        if stem is None:
+        stack = _as_stem(rings.subset(left[on]), height[left[on]], settings) if len(on) else None
+        if stack is None:
             break
-        stems.append(stem)
+        stems.append(stack)
+        stem, doubts = stack
+        if doubts:
+            break
         # What the stem explains goes with it, also rings of another size about the same axis.
         axis = stem.axis[0] + height[left][:, None] * stem.axis[1]
         left = left[np.hypot(*(rings.xy[left] - axis).T) > 0.03 + 0.5 * stem.radius_m]
@@ -233,8 +256,8 @@ def _best_line(xy: Float64, radius: Float64, height: Float64, coverage: Float64,
     return np.asarray(rows, np.int64) if support[best] > 0 else np.empty(0, np.int64)
 
 
-def _as_stem(rings: Rings, height: Float64, settings: TrunkSettings) -> Stem | None:
-    """The rings as a stem, or None where the evidence is too thin."""
+def _as_stem(rings: Rings, height: Float64, settings: TrunkSettings) -> _Stack | None:
+    """The rings as a stem, and the settings that speak against it; None where the evidence is too thin for any."""
     n = len(height)
     if n < 4:
         return None
@@ -242,7 +265,7 @@ def _as_stem(rings: Rings, height: Float64, settings: TrunkSettings) -> Stem | N
     coverage = float(rings.coverage_deg.mean())
     spread = float(np.median(np.abs(rings.radius - np.median(rings.radius)))) / float(np.median(rings.radius))
     length = min(settings.stem_length_m, 0.6 * (settings.slab_high_m - settings.slab_low_m))
-    if span < length or n * LAYER_M < 0.5 * span or coverage < settings.min_arc_deg or spread > 0.25:
+    if n * LAYER_M < 0.5 * span or spread > 0.25:
         return None
     # Chance circles in foliage have points inside and just outside; the surface of a stem stands free.
     clean = float(np.clip(1.0 - 2.0 * rings.inside_share - rings.clutter_share, -1.0, 1.0).sum())
@@ -251,7 +274,37 @@ def _as_stem(rings: Rings, height: Float64, settings: TrunkSettings) -> Stem | N
     design = np.column_stack([np.ones(n), height])
     axis = np.asarray(np.linalg.lstsq(design, rings.xy, rcond=None)[0], np.float64)
     order = np.argsort(height)
-    return Stem(axis, height[order], rings.xy[order], rings.radius[order], coverage, clean * coverage)
+    stem = Stem(axis, height[order], rings.xy[order], rings.radius[order], coverage, clean * coverage)
+    doubts = (("stem_length_m", span < length), ("min_arc_deg", coverage < settings.min_arc_deg))
+    return stem, tuple(name for name, is_doubt in doubts if is_doubt)
+
+
+def _near_misses(stacks: list[_Stack], stems: tuple[Stem, ...]) -> tuple[NearMiss, ...]:
+    """Those that stand by themselves: neither at a stem that was found nor at a surer near miss."""
+    known = list(stems)
+    misses = []
+    for stem, doubts in sorted(stacks, key=lambda stack: -stack[0].score):
+        middle = float(stem.heights_m.mean())
+        x, y = stem.xy_at(middle)
+        apart = [np.hypot(*(other.xy_at(middle) - (x, y))) - other.radius_m - stem.radius_m for other in known]
+        if min(apart, default=np.inf) < _APART_M:
+            continue
+        known.append(stem)
+        low, high = float(stem.heights_m[0]), float(stem.heights_m[-1])
+        misses.append(
+            NearMiss(
+                x_m=float(x),
+                y_m=float(y),
+                low_m=low,
+                high_m=high,
+                diameter_m=2.0 * stem.radius_m,
+                span_m=high - low + LAYER_M,
+                coverage_deg=stem.coverage_deg,
+                n_layers=len(stem.heights_m),
+                reasons=doubts,
+            )
+        )
+    return tuple(sorted(misses, key=lambda miss: (miss.x_m, miss.y_m)))
 
 
 def _without_doubles(stems: list[Stem]) -> tuple[Stem, ...]:

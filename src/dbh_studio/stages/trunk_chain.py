@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from dbh_studio.core.arrays import Bool, Float32, Float64, Int32, Int64
+from dbh_studio.core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
+from dbh_studio.core.chain_steps import NO_NORMAL, Cluster, Step, keep_clusters
 from dbh_studio.core.clusters import NOISE, dbscan
 from dbh_studio.core.neighbours import N_WORKERS, surface_normals
-from dbh_studio.core.otsu import otsu_threshold
 from dbh_studio.core.progress import Progress, subprogress
 from dbh_studio.core.voxels import Thinned, thin
 from dbh_studio.settings import TrunkSettings
@@ -22,23 +22,7 @@ from dbh_studio.stages.stem_tracking import StemModels, follow_stems
 # So many thinned points go through normals and DBSCAN at most; more are thinned further.
 _MAX_POINTS = 500_000
 _MAX_TRACKED = 1_000_000
-
-
-@dataclass(frozen=True)
-class Cluster:
-    """One DBSCAN cluster.
-
-    Attributes:
-        n_points: Of the full cloud.
-        stem: Index of the trunk it belongs to, -1 where none.
-        has_rings: Whether the detector saw stacked rings in it.
-        kept: Whether it is part of a trunk.
-    """
-
-    n_points: int
-    stem: int
-    has_rings: bool
-    kept: bool
+_WIDTH_LAYER_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +32,20 @@ class Outcome:
     Attributes:
         labels: (N,) trunk of every point given to the chain, -1 where none.
         stems: Per trunk what the detector saw of it, or None.
-        clusters: Largest first.
-        size_threshold: Otsu's, points.
-        n_candidates: Points on a stem's surface or in a mask.
-        n_facing_sideways: Of these, with a normal near the horizontal.
+        clusters: Largest first; their points are rows of what was given to the chain.
+        size_threshold: Points a cluster had to have.
+        steps: (N,) uint8 `Step` of every point given to the chain.
+        details: (N,) the cluster of what was dropped with it, the tilt in degrees of what does not face sideways.
+        joined_from: (8,) how many of the points that joined a trunk each `Step` had dropped before.
     """
 
     labels: Int32
     stems: tuple[Stem | None, ...]
     clusters: tuple[Cluster, ...]
     size_threshold: float
-    n_candidates: int
-    n_facing_sideways: int
+    steps: UInt8
+    details: Int32
+    joined_from: Int64
 
 
 class Chain:
@@ -117,33 +103,73 @@ class Chain:
         return self._run(owner, everything, everything)
 
     def _nothing(self) -> Outcome:
-        return Outcome(np.full(len(self.fine.order), -1, np.int32), (), (), float("nan"), 0, 0)
+        n = len(self.fine.order)
+        no_label, no_step = np.full(n, -1, np.int32), np.full(n, Step.NO_CANDIDATE, np.uint8)
+        return Outcome(no_label, (), (), float("nan"), no_step, np.zeros(n, np.int32), np.zeros(len(Step), np.int64))
 
     def _run(self, owner: Int32, is_candidate: Bool, may_join: Bool) -> Outcome:
         rows = np.flatnonzero(is_candidate)
         weight = self.fine.counts[rows].astype(np.float64)
         coarse, coarse_weight = self._coarse(rows, weight)
-        cluster, n_sideways = self._clustered(coarse, coarse_weight)
+        cluster, tilt_deg = self._clustered(coarse, coarse_weight)
         unit, unit_stem = _split_by_stem(cluster, _majority(owner[rows], coarse), len(self.stems))
         size = np.bincount(unit[unit >= 0], coarse_weight[unit >= 0], len(unit_stem)).astype(np.float64)
         has_rings = self._rings_in(unit, unit_stem, coarse)
-        kept, threshold = keep_clusters(size, has_rings, self.settings.small_clusters)
+        kept, threshold = keep_clusters(size, has_rings, self.settings)
         trunk_of_unit, stems = _trunks(unit_stem, kept, size, self.stems)
         label = np.full(len(coarse), -1, np.int32)
         label[unit >= 0] = trunk_of_unit[unit[unit >= 0]]
         fine_label = np.full(len(self.fine), -1, np.int32)
         fine_label[rows] = coarse.labels_of_points(label)
+        order = np.argsort(-size, kind="stable")
+        steps, details = self._steps(rows, coarse, tilt_deg, unit, kept, order)
         self.progress(0.9, "Collecting the trunks' points")
         fine_label = self._expanded(fine_label, owner, may_join, trunk_of_unit, unit_stem)
+        joined = np.flatnonzero((fine_label >= 0) & (steps != Step.KEPT))
+        joined_from = np.bincount(steps[joined], self.fine.counts[joined], len(Step)).astype(np.int64)
+        steps[joined] = Step.JOINED
+        places = self._places(rows, coarse, unit, len(unit_stem))
         clusters = [
-            Cluster(int(size[k]), int(trunk_of_unit[k]), bool(has_rings[k]), bool(kept[k])) for k in np.argsort(-size)
+            Cluster(int(size[k]), int(trunk_of_unit[k]), bool(has_rings[k]), bool(kept[k]), *places[k]) for k in order
         ]
-        return Outcome(
-            self.fine.labels_of_points(fine_label), stems, tuple(clusters), threshold, int(weight.sum()), n_sideways
-        )
+        back = self.fine.labels_of_points
+        return Outcome(back(fine_label), stems, tuple(clusters), threshold, back(steps), back(details), joined_from)
 
-    def _clustered(self, coarse: Thinned, weight: Float64) -> tuple[Int32, int]:
-        """(M,) DBSCAN cluster of every point that faces sideways, and how many cloud points those are."""
+    def _steps(
+        self, rows: Int64, coarse: Thinned, tilt_deg: UInt8, unit: Int32, kept: Bool, order: Int64
+    ) -> tuple[UInt8, Int32]:
+        """(F,) step of every thinned point before the expansion, and (F,) its `Outcome.details`."""
+        step, detail = np.full(len(coarse), Step.LOOSE, np.uint8), np.zeros(len(coarse), np.int32)
+        tilted = tilt_deg > 0
+        step[tilted], detail[tilted] = Step.NOT_SIDEWAYS, tilt_deg[tilted]
+        inside = np.flatnonzero(unit >= 0)
+        step[inside] = np.where(kept[unit[inside]], Step.KEPT, Step.DROPPED)
+        rank = np.empty(len(order), np.int32)
+        rank[order] = np.arange(len(order), dtype=np.int32)
+        detail[inside] = rank[unit[inside]]
+        steps, details = np.full(len(self.fine), Step.NO_CANDIDATE, np.uint8), np.zeros(len(self.fine), np.int32)
+        if len(rows):
+            steps[rows], details[rows] = coarse.labels_of_points(step), coarse.labels_of_points(detail)
+        return steps, details
+
+    def _places(self, rows: Int64, coarse: Thinned, unit: Int32, n_units: int) -> list[tuple[int, float, float, float]]:
+        """Per part of a cluster a row given to the chain in its middle, its width, and its lowest and highest point."""
+        if not n_units:
+            return []
+        inside = np.flatnonzero(unit >= 0)
+        inside = inside[np.argsort(unit[inside], kind="stable")]
+        starts = np.searchsorted(unit[inside], np.arange(n_units))
+        points = coarse.points[inside].astype(np.float64)
+        lower, upper = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+        middle = np.add.reduceat(points, starts) / np.diff(starts, append=len(inside))[:, None]
+        off = np.sqrt(((points - middle[unit[inside]]) ** 2).sum(axis=1))
+        nearest = inside[np.lexsort((off, unit[inside]))[starts]]
+        row = self.fine.order[self.fine.starts[rows[coarse.order[coarse.starts[nearest]]]]]
+        width = _widths(unit[inside], points)
+        return [(int(row[k]), float(width[k]), float(lower[k, 2]), float(upper[k, 2])) for k in range(n_units)]
+
+    def _clustered(self, coarse: Thinned, weight: Float64) -> tuple[Int32, UInt8]:
+        """(M,) DBSCAN cluster of every point that faces sideways, and (M,) tilt in degrees of what does not, else 0."""
         self.progress(0.45, "Looking which way surfaces face")
         normals = surface_normals(
             coarse.points,
@@ -151,7 +177,8 @@ class Chain:
             max_neighbours=20,
             progress=subprogress(self.progress, 0.45, 0.7),
         )[0]
-        sideways = np.abs(normals[:, 2]) <= np.sin(np.radians(self.settings.normal_max_deg))
+        up = np.abs(normals[:, 2])
+        sideways = up <= np.sin(np.radians(self.settings.normal_max_deg))
         self.progress(0.7, "Clustering")
         cluster = np.full(len(coarse), NOISE, np.int32)
         cluster[sideways] = dbscan(
@@ -160,7 +187,8 @@ class Chain:
             min_points=self.settings.cluster_min_points,
             weights=weight[sideways],
         )
-        return cluster, int(weight[sideways].sum())
+        tilt_deg = np.where(np.isnan(up), NO_NORMAL, np.ceil(np.degrees(np.arcsin(np.minimum(up, 1.0)))))
+        return cluster, np.where(sideways, 0, tilt_deg).astype(np.uint8)
 
     def _coarse(self, rows: np.ndarray, weight: Float64) -> tuple[Thinned, Float64]:
         """The candidates thinned to what the cluster distance needs, and how many cloud points each stands for."""
@@ -212,31 +240,17 @@ class Chain:
         return expanded
 
 
-def keep_clusters(size: Float64, has_rings: Bool, rule: str) -> tuple[Bool, float]:
-    """Which clusters are trunks.
-
-    Otsu's threshold always splits: among stems only it drops the smaller ones. So by default (``evidence``) what has
-    rings stays whatever its size, and the threshold, on the logarithm of size because fragments and stems differ by
-    orders of magnitude, only judges the rest.
-
-    Args:
-        size: (U,) points per cluster.
-        has_rings: (U,) whether the detector saw stacked rings in it.
-        rule: ``evidence``, ``otsu`` (the paper: size alone) or ``keep``.
-
-    Returns:
-        (U,) which to keep, and the threshold in points (NaN where none was needed).
-    """
-    if not len(size) or rule == "keep":
-        return np.ones(len(size), bool), float("nan")
-    if rule == "otsu":
-        threshold = otsu_threshold(size)
-    else:
-        threshold = float(np.exp(otsu_threshold(np.log(np.maximum(size, 1.0)))))
-        # exp(log(x)) may be a hair above x.
-        threshold *= 1.0 - 1e-9
-    large = size >= threshold
-    return (large if rule == "otsu" else large | has_rings), threshold
+def _widths(unit: Int32, points: Float64) -> Float64:
+    """(U,) width of every unit: of its layers' larger extents in plan the median, so that leaning does not count."""
+    layer = np.floor(points[:, 2] / _WIDTH_LAYER_M).astype(np.int64)
+    order = np.lexsort((layer, unit))
+    unit, layer, points = unit[order], layer[order], points[order]
+    starts = np.flatnonzero(np.concatenate([[True], (np.diff(unit) != 0) | (np.diff(layer) != 0)]))
+    across = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
+    extent, of_unit = across[:, :2].max(axis=1), unit[starts]
+    ranked = np.lexsort((extent, of_unit))
+    first = np.searchsorted(of_unit, np.arange(of_unit[-1] + 1))
+    return np.asarray(extent[ranked[first + np.diff(first, append=len(of_unit)) // 2]], np.float64)
 
 
 def _majority(owner: Int32, coarse: Thinned) -> Int32:

@@ -186,6 +186,35 @@ class MaskStore:
             del self._entries[image]
             return None
 
+    def is_of(self, image: str, photo: Path | str | None) -> bool:
+        """Whether there is a mask of a photo as the photo is now; a photo that is not on this computer has not changed.
+
+        Its picture is not read: `get` and `read_stored` tell whether that is whole.
+        """
+        entry = self._entries.get(image)
+        return entry is not None and self._is_current(entry, None if photo is None else Path(photo), None)
+
+    def take(self, other: MaskStore) -> None:
+        """Copy all masks of another store, with what a person said of them; of a photo that both have, the other's.
+
+        Each is either here or not, whenever this is interrupted.
+
+        Raises:
+            FileError: A picture cannot be read, or the folder cannot be written.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for entry in other.entries:
+                try:
+                    data = (other.folder / entry.file).read_bytes()
+                except FileNotFoundError:
+                    continue  # it would be made anew there, too
+                with atomic_file(self.folder / entry.file) as file:
+                    file.write(data)
+                self._append(entry)
+        except OSError as error:
+            raise self._cannot_write(error) from error
+
     def to_do(self, photos: Mapping[str, Path], recipe: MaskRecipe) -> tuple[str, ...]:
         """Names of the photos whose mask is missing, damaged or made from something else, in the order given."""
         entries = ((image, self._entries.get(image)) for image in photos)
@@ -280,6 +309,23 @@ class MaskStore:
     def _cannot_write(self, error: OSError) -> FileError:
         reason = error.strerror or str(error)
         return FileError(self.folder, f"The masks cannot be stored: {reason}.", "Make room, or allow writing there.")
+
+
+def read_stored(folder: Path, entry: StoredMask) -> TrunkMask:
+    """The mask of a line of the index, without the store it is from; for jobs that only read.
+
+    Raises:
+        FileError: The picture is missing or damaged.
+    """
+    path = folder / entry.file
+    try:
+        if hashlib.sha256(path.read_bytes()).hexdigest() != entry.sha256:
+            raise ValueError("it is not what was written")
+        return _from_png(path, entry)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise FileError(
+            path, f"The mask cannot be read ({error}).", "Make it anew: `dbh-studio masks make`."
+        ) from error
 
 
 def _json_object(line: str) -> dict[str, Any] | None:
