@@ -131,3 +131,18 @@ def test_photos_that_are_not_there_are_only_needed_to_be_drawn(plot, tmp_path, c
     assert "--images" in fails(capsys, [*run, "--mask-overlay", tmp_path / "look.jpg"], 1)
     out, _ = runs(capsys, [*run, "--json"])
     assert json.loads(out)["n_stems"] == 4
+
+
+def test_stems_that_masks_do_not_show_are_counted_and_accepted_where_asked_for(plot, tmp_path, capsys):
+    _, err = runs(capsys, command(plot, tmp_path / "offered", "--mask-category", "1-2"))
+    assert "note: 2 candidates were found" in err
+    assert (tmp_path / "offered" / "plot.dbh" / "cache" / "candidates.npz").is_file()
+    assert len(read_project(tmp_path / "offered" / "plot.dbh").trunks) == 2
+    _, err = runs(capsys, command(plot, tmp_path / "taken", "--mask-category", "1-2", "--accept-candidates"))
+    assert "note: 2 candidates were taken as trunks, and flagged." in err
+    state = read_project(tmp_path / "taken" / "plot.dbh")
+    assert len(state.trunks) == 4 and sum("none calls it trunk" in tree.flag for tree in state.trees.values()) == 2
+    with (tmp_path / "taken" / "plot.csv").open(newline="") as file:
+        assert sum("no trunk by the masks" in row["reason"] for row in csv.DictReader(file)) == 2
+    message = fails(capsys, ["run", plot.cloud, "--out", tmp_path, "--scale", 1, "--accept-candidates"], 2)
+    assert "--accept-candidates" in message and "--masks PATH" in message

@@ -90,3 +90,49 @@ def test_masks_without_numbers_and_no_masks_tie_nothing():
     ties = gatherer.ties()
     assert ties.n_trunks == 0 and not ties.trunk_of_voter.any()
     assert len(InstanceGatherer(np.empty((0, 3))).ties().trunk_of_voter) == 0
+
+
+def test_masks_that_lie_over_two_trunks_do_not_tie_them_even_in_many_photos():
+    points, tree = stand()
+    gatherer = InstanceGatherer(points)
+    for k, azimuth in enumerate(range(0, 360, 30)):
+        labels = tree.copy()
+        if k % 4 == 1:
+            labels[labels == 2] = 1
+        gatherer.add(shot(f"{k}", points, labels, azimuth))
+    ties = gatherer.ties()
+    first, second = ties.trunk_of_voter[tree == 1], ties.trunk_of_voter[tree == 2]
+    assert not set(np.unique(first)) & set(np.unique(second))
+    voters = np.arange(len(points))
+    assert ties.apart_and_together(voters[tree == 1], voters[tree == 2]) == (9, 3)
+    assert ties.apart_and_together(voters[tree == 3], voters[tree == 4]) == (12, 0)
+
+
+def test_a_number_for_a_class_is_no_trunk():
+    """All trunks under one number, 4 m of them: nothing is tied by it."""
+    points, tree = stand(5)
+    gatherer = InstanceGatherer(points)
+    for k, azimuth in enumerate(range(0, 360, 45)):
+        gatherer.add(shot(f"{k}", points, np.ones_like(tree), azimuth))
+    assert gatherer.ties().n_trunks == 0
+
+
+def test_only_candidates_are_tied():
+    points, tree = stand()
+    gatherer = InstanceGatherer(points)
+    for k, azimuth in enumerate(range(0, 360, 45)):
+        gatherer.add(shot(f"{k}", points, tree, azimuth))
+    ties = gatherer.ties(tree <= 2)
+    assert ties.n_trunks == 2 and not ties.trunk_of_voter[tree > 2].any()
+
+
+def test_how_many_photos_see_a_trunk_and_call_it_one():
+    points, tree = stand()
+    gatherer = InstanceGatherer(points)
+    for k, azimuth in enumerate(range(0, 360, 45)):
+        photo = shot(f"{k}", points, np.where((tree == 2) & (k >= 3), 0, tree), azimuth)
+        keep = tree[photo.rows] != 3
+        gatherer.add(PhotoVotes(photo.name, photo.rows[keep], photo.labels[keep], has_instances=k % 2 == 0))
+    seen = [gatherer.in_view(np.flatnonzero(tree == name)) for name in (1, 2, 3)]
+    assert [(each.n_seen, each.n_called) for each in seen] == [(8, 8), (8, 3), (0, 0)]
+    assert gatherer.in_view(np.empty(0, np.int64)).n_seen == 0

@@ -10,23 +10,27 @@ or all of it by `trunks_from_masks`. `find_image_trunks` is pure and picklable, 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.app.brought_masks import MaskReader, MaskRequest, MaskSet, read_masks
+from dbh_studio.app.brought_masks import MaskReader, MaskRequest, MaskSet, VotingMasks, read_masks
 from dbh_studio.app.cameras import Cameras, cameras_of
+from dbh_studio.app.candidates import accept_all, offering
 from dbh_studio.app.commands import replace_trunks
 from dbh_studio.app.document import CameraSource, Document
 from dbh_studio.app.jobs import Job, run_job
+from dbh_studio.app.last_search import apply_search
 from dbh_studio.app.photo_scale import PhotoRequest, add_photos
 from dbh_studio.app.pipeline import SEGMENTATION_READS, segment_plot, segmentation_call
 from dbh_studio.app.session import Session
 from dbh_studio.app.threads import map_in_threads
+from dbh_studio.app.vote_cache import keep_votes, record_of
 from dbh_studio.core.arrays import Float32
+from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.posed_images import PosedImages
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.transforms import Similarity
@@ -34,6 +38,8 @@ from dbh_studio.core.trunks import TrunkSet
 from dbh_studio.settings import Settings, VoteSettings
 
 if TYPE_CHECKING:
+    from dbh_studio.core.candidates import CandidateTrunk
+    from dbh_studio.core.chain_steps import ChainSteps
     from dbh_studio.core.ground import GroundModel
     from dbh_studio.core.votes import Votes
 
@@ -60,6 +66,10 @@ class ImageTrunks:
         rung: ``masks``, or ``geometry`` where the masks could not find trunks.
         n_masks: Masks that voted.
         votes: (N,) of every point, to colour the cloud by; None where no mask was asked.
+        candidates: Where masks and shape disagree so much that a person should say, from west to east.
+        flags: Trunk id -> what masks and geometry disagree about.
+        steps: What the chain did with every point and cluster; None where no mask was asked.
+        record: What is saved of the masks the trunks came from; None where they came from geometry.
     """
 
     ground: GroundModel
@@ -68,6 +78,10 @@ class ImageTrunks:
     rung: Rung
     n_masks: int = 0
     votes: Votes | None = None
+    candidates: tuple[CandidateTrunk, ...] = ()
+    flags: Mapping[int, str] = field(default_factory=dict)
+    steps: ChainSteps | None = None
+    record: MaskRecord | None = None
 
 
 def find_image_trunks(
@@ -75,7 +89,7 @@ def find_image_trunks(
     settings: Settings,
     existing_ids: NDArray[Any] | None,
     posed_world: PosedImages,
-    masks: MaskSet,
+    masks: VotingMasks,
     votes: VoteSettings = VoteSettings(),  # noqa: B008 - frozen
     *,
     progress: Progress = ignore_progress,
@@ -99,35 +113,68 @@ def find_image_trunks(
         CancelledError: From `progress`.
     """
     from dbh_studio.core.ground import fit_ground
-    from dbh_studio.stages.vote import trunk_candidates
+    from dbh_studio.core.instances import InstanceGatherer
+    from dbh_studio.stages.mask_trunks import trunks_from_votes
+    from dbh_studio.stages.vote import make_voters, vote
 
     if not masks.finds_trunks:
         return _by_geometry(points_world, settings, existing_ids, _ONLY_IGNORED, progress=progress)
-    ground = fit_ground(points_world, settings=settings.ground, progress=subprogress(progress, 0.0, 0.15))
+    ground = fit_ground(points_world, settings=settings.ground, progress=subprogress(progress, 0.0, 0.1))
     reader = MaskReader(masks, votes.edge_px)
+    voters = make_voters(
+        points_world,
+        posed_world,
+        ground=ground,
+        settings=votes,
+        trunks=settings.trunks,
+        progress=subprogress(progress, 0.1, 0.2),
+    )
+    gatherer = InstanceGatherer(voters.points.xyz)
     # Reading a picture silences warnings for a moment, and two threads at once may leave them silent: undone here.
     with warnings.catch_warnings():
-        counted = trunk_candidates(
-            points_world,
+        of_voters = vote(
+            voters,
             posed_world,
             reader,
-            ground=ground,
             settings=votes,
-            trunks=settings.trunks,
+            on_photo=lambda _, photo: gatherer.add(photo),
             map_photos=map_in_threads,
-            progress=subprogress(progress, 0.15, 0.75),
+            progress=subprogress(progress, 0.2, 0.7),
         )
     if not reader.n_read and reader.problems:
         raise min(reader.problems.items())[1]
+    counted = of_voters.carried_back(voters.thinned, voters.rows, voters.n_points)
     candidates = counted.is_trunk(votes)
     about = (*reader.notes(), _vote_note(counted, candidates, votes))
-    rest = subprogress(progress, 0.75, 1.0)
+    rest = subprogress(progress, 0.7, 1.0)
     if not candidates.any():
-        found = _by_geometry(points_world, settings, existing_ids, _NO_CANDIDATE, ground=ground, progress=rest)
-        return ImageTrunks(found.ground, found.trunks, (*found.notes, *about), "geometry", reader.n_read, counted)
-    _, trunks, notes = segment_plot(points_world, settings, candidates=candidates, ground=ground, progress=rest)
+        by_shape = _by_geometry(points_world, settings, existing_ids, _NO_CANDIDATE, ground=ground, progress=rest)
+        return replace(by_shape, notes=(*by_shape.notes, *about), n_masks=reader.n_read, votes=counted)
+    found = trunks_from_votes(
+        points_world,
+        ground,
+        voters,
+        of_voters,
+        gatherer,
+        trunks=settings.trunks,
+        settings=votes,
+        progress=rest,
+        seed=settings.measure.seed,
+    )
+    progress(1.0, "")
     first = f"Trunks from {reader.n_read:,} {'mask' if reader.n_read == 1 else 'masks'}."
-    return ImageTrunks(ground, trunks, (first, *about, *notes), "masks", reader.n_read, counted)
+    return ImageTrunks(
+        ground,
+        TrunkSet.from_point_sets(found.point_sets, origin="masks"),
+        (first, *about, *ground.notes, *found.notes),
+        "masks",
+        reader.n_read,
+        counted,
+        found.candidates,
+        {index + 1: text for index, text in found.flags.items()},
+        found.steps,
+        record_of(masks, reader.n_read, votes),
+    )
 
 
 def _by_geometry(
@@ -139,8 +186,9 @@ def _by_geometry(
     ground: GroundModel | None = None,
     progress: Progress,
 ) -> ImageTrunks:
-    ground, trunks, notes = segment_plot(points_world, settings, existing_ids, ground=ground, progress=progress)
-    return ImageTrunks(ground, trunks, (f"Trunks by geometry alone, because {why}.", *notes), "geometry")
+    found = segment_plot(points_world, settings, existing_ids, ground=ground, progress=progress)
+    notes = (f"Trunks by geometry alone, because {why}.", *found.notes)
+    return ImageTrunks(found.ground, found.trunks, notes, "geometry", steps=found.steps)
 
 
 def _vote_note(votes: Votes, candidates: NDArray[np.bool_], settings: VoteSettings) -> str:
@@ -169,7 +217,7 @@ def image_trunks_call(
     session: Session,
     document: Document,
     cameras: Cameras,
-    masks: MaskSet,
+    masks: VotingMasks,
     votes: VoteSettings = VoteSettings(),  # noqa: B008 - frozen
 ) -> tuple[Any, ...]:
     """The arguments of `find_image_trunks` for a state of a plot.
@@ -190,7 +238,12 @@ def apply_image_trunks(session: Session, document: Document, result: ImageTrunks
     session.remember_ground(document, result.ground)
     label = f"Find {len(result.trunks)} trunks"
     label += f" from {result.n_masks} masks" if result.rung == "masks" else ""
-    session.do(replace_trunks(result.trunks, label=label), based_on=document, reads=IMAGE_TRUNK_READS)
+    n_trunks = len(result.trunks)
+    command = replace_trunks(result.trunks, label=label, masks=result.record, flags=result.flags)
+    with offering(session, document, result.candidates):
+        apply_search(session, document, command, result.steps, n_trunks=n_trunks, reads=IMAGE_TRUNK_READS)
+    if result.votes is not None and result.record is not None:
+        keep_votes(session, result.votes)
 
 
 def masks_of_plot(
@@ -212,9 +265,10 @@ def masks_of_plot(
 
 def trunks_from_masks(
     session: Session,
-    masks: MaskSet,
+    masks: VotingMasks,
     votes: VoteSettings = VoteSettings(),  # noqa: B008 - frozen
     *,
+    accept_candidates: bool = False,
     in_process: bool = True,
     progress: Progress = ignore_progress,
     started: Callable[[Job], object] | None = None,
@@ -225,6 +279,7 @@ def trunks_from_masks(
         session: A plot that has photos; see `masks_of_plot`.
         masks: Theirs.
         votes: What hides a point and how many votes make it trunk.
+        accept_candidates: Take stems that only geometry sees as trunks, too: flagged, as a second command.
         in_process: Work here rather than in a child process.
         progress: Called in between; cancels by raising `CancelledError`.
         started: Given the job, so that another thread can cancel it.
@@ -238,6 +293,9 @@ def trunks_from_masks(
     call = image_trunks_call(session, document, cameras, masks, votes)
     result: ImageTrunks = run_job(find_image_trunks, *call, in_process=in_process, progress=progress, started=started)
     apply_image_trunks(session, document, result)
+    if accept_candidates and (n_taken := accept_all(session)):
+        what = "1 candidate was" if n_taken == 1 else f"{n_taken:,} candidates were"
+        result = replace(result, notes=(*result.notes, f"{what} taken as trunks, and flagged."))
     return result
 
 

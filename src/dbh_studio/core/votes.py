@@ -114,6 +114,8 @@ class VoteCounter:
         self._n_trunk = np.zeros(n_voters, np.uint16)
         self._weight_seen = np.zeros(n_voters, np.float32)
         self._weight_trunk = np.zeros(n_voters, np.float32)
+        # Without weights the sums are the counts, and are not added up a second time.
+        self._has_weights = False
 
     def __len__(self) -> int:
         return len(self._n_seen)
@@ -123,12 +125,15 @@ class VoteCounter:
         if photo.name in self.done:
             return
         rows, is_trunk = photo.rows, photo.labels > 0
-        weights = np.float32(1.0) if photo.weights is None else photo.weights
+        if photo.weights is not None or self._has_weights:
+            weights = np.ones(len(rows), np.float32) if photo.weights is None else photo.weights
+            self._sum_counts()
+            self._has_weights = True
+            self._weight_seen[rows] += weights
+            self._weight_trunk[rows] += weights * is_trunk.astype(np.float32)
         # No row is there twice, so adding through an index is right.
         self._n_seen[rows] += np.uint16(1)
-        self._n_trunk[rows] += is_trunk.astype(np.uint16)
-        self._weight_seen[rows] += weights
-        self._weight_trunk[rows] += weights * is_trunk.astype(np.float32)
+        self._n_trunk[rows[is_trunk]] += np.uint16(1)
         self.done.add(photo.name)
 
     def skip(self, name: str) -> None:
@@ -157,13 +162,23 @@ class VoteCounter:
         if not wanted <= set(state) or int(state["version"]) != _VERSION or str(state["key"]) != key:
             return None
         counter = cls(n_voters, key)
-        for name, array in counter._arrays().items():
+        for name in _ARRAYS:
+            array = getattr(counter, f"_{name}")
             stored = np.asarray(state[name])
             if stored.shape != array.shape or stored.dtype != array.dtype:
                 return None
             array[:] = stored
         counter.done = {str(name) for name in state["done"]}
+        counter._has_weights = any(
+            not np.array_equal(sums, counts)
+            for sums, counts in ((counter._weight_seen, counter._n_seen), (counter._weight_trunk, counter._n_trunk))
+        )
         return counter
 
+    def _sum_counts(self) -> None:
+        if not self._has_weights:
+            self._weight_seen[:], self._weight_trunk[:] = self._n_seen, self._n_trunk
+
     def _arrays(self) -> dict[str, NDArray[Any]]:
+        self._sum_counts()
         return {name: getattr(self, f"_{name}") for name in _ARRAYS}

@@ -40,6 +40,7 @@ MapPhotos: TypeAlias = Callable[
 """As the built-in `map`; `app.threads.map_in_threads` shares the photos between two threads."""
 
 _CHUNK = 1 << 20
+_PIECE = 1 << 16
 _SPACING_SAMPLE = 300_000
 
 
@@ -69,12 +70,26 @@ class Points:
 
     def near(self, centre: Float64, distance_m: float) -> tuple[Int64, Float32, Float32]:
         """(K,) ascending rows within a distance, (K, 3) their offsets from `centre`, (K,) their distances."""
+        parts = list(self.pieces_near(centre, distance_m))
+        if not parts:
+            return np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+        rows, offset, distance = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return rows, offset, distance
+
+    def pieces_near(self, centre: Float64, distance_m: float) -> Iterator[tuple[Int64, Float32, Float32]]:
+        """As `near`, in pieces that stay in the processor's cache from one step of the arithmetic to the next."""
         first = int(np.searchsorted(self.envelope_x, centre[0] - distance_m, side="left"))
         last = int(np.searchsorted(self.envelope_x, centre[0] + distance_m + 2.0 * self.edge_m, side="right"))
-        offset = (self.xyz[first:last] - centre).astype(np.float32)
-        distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
-        inside = np.flatnonzero(distance <= distance_m)
-        return inside + first, offset[inside], distance[inside]
+        middle = centre.astype(np.float32)
+        for start in range(first, last, _PIECE):
+            offset = self.xyz[start : min(start + _PIECE, last)] - middle
+            distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+            inside = distance <= distance_m
+            if inside.all():
+                yield np.arange(start, start + len(offset)), offset, distance
+            elif inside.any():
+                rows = np.flatnonzero(inside)
+                yield rows + start, offset[rows], distance[rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,17 +213,28 @@ def vote(
 def photo_votes(voters: Voters, photo: PosedImage, view: MaskView, settings: VoteSettings) -> PhotoVotes:
     """What one photo says of the voters it sees."""
     centre = photo.centre_src
-    rows, offset, distance = voters.points.near(centre, settings.max_distance_m)
-    if settings.occlusion and len(rows):
+    depth = None
+    if settings.occlusion:
         _, around, _ = voters.occluders.near(centre, settings.max_distance_m)
         depth = DepthMap.of(around, spacing=voters.occluders.spacing_m, size=settings.depth_size_px)
-        hidden = depth.is_hidden(offset, tolerance=settings.tolerance_m, tolerance_share=settings.tolerance_share)
-        rows, offset, distance = rows[~hidden], offset[~hidden], distance[~hidden]
     turn = photo.cam_from_source.rotation.astype(np.float32)
-    labels, is_known = view.look_up(offset @ turn.T)
-    weights = _weights(voters, rows[is_known], offset[is_known], distance[is_known], settings)
-    seen = rows[is_known].astype(np.int32)
-    return PhotoVotes(photo.name, seen, labels[is_known], weights, view.has_instances)
+    seen, found, weighed = [np.empty(0, np.int32)], [np.empty(0, np.int32)], [np.empty(0, np.float32)]
+    for rows, offset, distance in voters.points.pieces_near(centre, settings.max_distance_m):
+        if depth is not None:
+            hidden = depth.is_hidden(offset, tolerance=settings.tolerance_m, tolerance_share=settings.tolerance_share)
+            in_sight = np.flatnonzero(~hidden)
+            rows, offset, distance = rows[in_sight], offset[in_sight], distance[in_sight]
+        labels, is_known = view.look_up(offset @ turn.T)
+        if not is_known.all():
+            known = np.flatnonzero(is_known)
+            rows, offset, distance, labels = rows[known], offset[known], distance[known], labels[known]
+        seen.append(rows.astype(np.int32))
+        found.append(labels)
+        weights = _weights(voters, rows, offset, distance, settings)
+        if weights is not None:
+            weighed.append(weights)
+    joined = None if settings.weighting == "none" else np.concatenate(weighed)
+    return PhotoVotes(photo.name, np.concatenate(seen), np.concatenate(found), joined, view.has_instances)
 
 
 def new_counter(voters: Voters, posed: PosedImages, settings: VoteSettings) -> VoteCounter:
@@ -218,7 +244,8 @@ def new_counter(voters: Voters, posed: PosedImages, settings: VoteSettings) -> V
     """
     digest = hashlib.sha256()
     # What decides afterwards is left out: another threshold needs no new votes.
-    digest.update(settings.model_dump_json(exclude={"rule", "min_share", "min_count"}).encode())
+    after = {"rule", "min_share", "min_count", "tell_apart", "second_look"}
+    digest.update(settings.model_dump_json(exclude=after).encode())
     digest.update(np.ascontiguousarray(voters.points.xyz).data)
     for photo in posed:
         camera = photo.camera
