@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 
 import viser
 
+from dbh_studio.errors import SettingError
 from dbh_studio.settings import SettingsModel
 from dbh_studio.ui.panels.base import set_value
 
@@ -45,7 +46,8 @@ class SettingsForm(Generic[Model]):
         Raises:
             SettingError: A value is outside its bounds; it says which one and what is allowed.
         """
-        changed: Model = self._values.changed(**{name: handle.value for name, handle in self._handles.items()})
+        typed = {name: _typed(self._values, name, handle.value) for name, handle in self._handles.items()}
+        changed: Model = self._values.changed(**typed)
         return changed
 
     def show(self, values: Model) -> None:
@@ -57,7 +59,7 @@ class SettingsForm(Generic[Model]):
             return
         self._values = values
         for name, handle in self._handles.items():
-            set_value(handle, getattr(values, name))
+            set_value(handle, _shown(getattr(values, name)))
 
 
 def _add_input(gui: viser.GuiApi, values: SettingsModel, name: str) -> Any:
@@ -70,9 +72,27 @@ def _add_input(gui: viser.GuiApi, values: SettingsModel, name: str) -> Any:
         return gui.add_dropdown(label, typing.get_args(field.annotation), initial_value=value, hint=hint)
     if isinstance(value, bool):
         return gui.add_checkbox(label, value, hint=hint)
+    if isinstance(value, (str, tuple)):
+        return gui.add_text(label, _shown(value), hint=hint)
     low, high = bounds(type(values), name)
     step: Any = 1 if isinstance(value, int) else 0.01 if value < 10 else 0.5
     return gui.add_number(label, value, min=low, max=high, step=step, hint=hint)
+
+
+def _shown(value: Any) -> Any:
+    """A value as its input shows it: several numbers with commas between."""
+    return ", ".join(f"{number:g}" for number in value) if isinstance(value, tuple) else value
+
+
+def _typed(values: SettingsModel, name: str, text: Any) -> Any:
+    """The value of a field from what its input holds; `_shown` backwards."""
+    if not isinstance(getattr(values, name), tuple):
+        return text
+    try:
+        return tuple(float(part) for part in str(text).replace(";", ",").split(",") if part.strip())
+    except ValueError:
+        title = type(values).model_fields[name].title
+        raise SettingError(f"{title}: {text!r} is no list of numbers.", "Write them with commas between.") from None
 
 
 def _hint(model: type[SettingsModel], name: str, unit: str) -> str | None:

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
+from itertools import zip_longest
 
-from dbh_studio.core.dbh import DbhEstimate, Refusal
+import numpy as np
+
+from dbh_studio.core.dbh import DbhEstimate, Diameter, Refusal
+from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.ui.bridge import call, esc, js
 from dbh_studio.ui.steps import STEP_TITLES, PlotStatus, StepName
 
@@ -14,13 +18,24 @@ from dbh_studio.ui.steps import STEP_TITLES, PlotStatus, StepName
 TABLE_COLUMNS: tuple[tuple[str, str, str, bool], ...] = (
     ("id", "Tree", "Tree number", False),
     ("dbh", "DBH cm", "Diameter at breast height", False),
-    ("quality", "Quality", "From the arc seen, the residual and the agreement of the curves", True),
+    (
+        "quality",
+        "Quality",
+        "From the width of the interval; of the paper's curves from arc, residual and agreement",
+        True,
+    ),
     ("arc", "Arc °", "How much of the ring was seen", False),
     ("remark", "Remark", "Species, note, what to look at, or why there is no diameter", True),
 )
 # A script may arrive together with the HTML it is about, and the page draws that a moment later.
 _NOW_AND_ONCE_DRAWN = "f();setTimeout(f,80);"
-CURVE_TITLES: Mapping[str, str] = {"fourier": "Fourier", "ellipse": "Ellipse", "bspline": "B-spline"}
+CURVE_TITLES: Mapping[str, str] = {
+    "shrinkage": "Shrinkage curve",
+    "circle": "Circle",
+    "fourier": "Fourier",
+    "ellipse": "Ellipse",
+    "bspline": "B-spline",
+}
 
 
 def style_js() -> str:
@@ -168,13 +183,14 @@ def _card_title(tree_id: int) -> str:
     return f'<h3>Tree {tree_id}</h3><span class="dbh-neighbours">{before}{after}</span>'
 
 
-def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "") -> str:
+def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "", scale: str = "") -> str:
     """What the forester reads after clicking a trunk.
 
     Args:
         tree_id: Its number.
         result: The diameter, or why there is none.
         section: The picture of the cross-section, see `section_svg`.
+        scale: What of the scale's error is in the interval, see `scale_words`.
     """
     title = _card_title(tree_id)
     if isinstance(result, Refusal):
@@ -184,22 +200,61 @@ def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "")
             f'<div class="dbh-hint" data-level="stop">{esc(plain(result.reason))}'
             f"<br><b>What to do:</b> {esc(plain(result.remedy))}</div>{section}</div>"
         )
-    cut = result.section
+    flags = "".join(
+        f'<li data-level="warn" data-flag="{esc(code)}">{esc(plain(flag))}</li>'
+        for code, flag in zip_longest(result.flag_codes, result.flags, fillvalue="")
+    )
+    tip = "in 9 of 10 cases the tape reads within these" if result.interval else "this method gives no interval"
+    interval = f" {_range(result.diameters[result.definition])}" if result.interval else ""
+    return (
+        f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><div class="dbh-number">'
+        f'{title}<b>{result.dbh_cm:.1f}</b><small title="{tip}">cm{interval}</small>'
+        f'<span class="dbh-badge" data-quality="{esc(result.quality)}">{esc(result.quality)}</span></div>'
+        f"{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(_card_facts(result, scale))}</div>"
+    )
+
+
+def _card_facts(result: DbhEstimate, scale: str) -> list[tuple[str, str]]:
+    """How a diameter was measured, and what else is known of the stem."""
+    cut, diameters = result.section, result.diameters
     low, high = cut.band_m
+    others = [f"{DEFINITION_TITLES[name]} {_with_range(diameters[name])}" for name in diameters]
+    girth = diameters["tape"]
+    round_cm = [np.pi * value for value in (girth.value_cm, girth.low_cm, girth.high_cm) if value is not None]
     pairs = [
-        ("Measured at", f"{low:.2f}–{high:.2f} m, middle {cut.hom_m:.2f} m"),
-        ("Read from", f"{CURVE_TITLES.get(result.curve, result.curve)} curve, {_definition(result)}"),
+        ("Measured at", f"{cut.hom_m:.2f} m; shown: {low:.2f}–{high:.2f} m"),
+        ("Read from", f"{CURVE_TITLES.get(result.curve, result.curve)}, {_definition(result)}"),
+        ("Interval", f"90 %{scale}" if result.interval else "none: this method has none that is honest"),
+        ("Tape round it", _in_brackets(round_cm) + " cm"),
+        ("By definition", ", ".join(others)),
         ("Ring seen", f"{cut.coverage_deg:.0f}°, largest gap {cut.max_gap_deg:.0f}°"),
         ("Scatter", f"{result.rmse_mm:.1f} mm about the curve, {result.n_points:,} points"),
         ("Lean", f"{cut.lean_deg:.0f}°"),
     ]
-    flags = "".join(f'<li data-level="warn">{esc(plain(flag))}</li>' for flag in result.flags)
-    return (
-        f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><div class="dbh-number">'
-        f"{title}<b>{result.dbh_cm:.1f}</b><small>cm DBH</small>"
-        f'<span class="dbh-badge" data-quality="{esc(result.quality)}">{esc(result.quality)}</span></div>'
-        f"{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(pairs)}</div>"
-    )
+    if result.taper_cm_per_m is not None:
+        pairs.append(("Taper", f"{result.taper_cm_per_m:.1f} cm per metre"))
+    return pairs
+
+
+def scale_words(scale: ScaleEstimate) -> str:
+    """What of the scale's error is in the interval, to follow “90 %”."""
+    if scale.standard_error:
+        return f", the ±{100 * scale.relative_sd:.2g} % of the scale included"
+    exact = scale.source in ("metres", "feet", "millimetres") or scale.standard_error == 0
+    return "" if exact else ", without the error of the scale, which is not known"
+
+
+def _with_range(diameter: Diameter) -> str:
+    ends = [diameter.value_cm, diameter.low_cm, diameter.high_cm]
+    return _in_brackets([value for value in ends if value is not None])
+
+
+def _range(diameter: Diameter) -> str:
+    return f"({diameter.low_cm:.1f}–{diameter.high_cm:.1f})"
+
+
+def _in_brackets(values: Sequence[float]) -> str:
+    return f"{values[0]:.1f}" + (f" ({values[1]:.1f}–{values[2]:.1f})" if len(values) == 3 else "")
 
 
 def _definition(result: DbhEstimate) -> str:

@@ -22,6 +22,10 @@ _WIDEST_RAD, _STEEPEST_RAD = np.deg2rad(110.0), np.deg2rad(89.0)
 _FIRST_RAD = np.deg2rad(85.0)
 
 
+Reach = tuple[tuple[tuple[float, float], ...], tuple[float, float]]
+"""((u from, u to), …), (v from, v to): parts of a photo side by side, in its pixels; two at the seam."""
+
+
 class Look(ABC):
     """One view of one photo; immutable."""
 
@@ -58,6 +62,10 @@ class Look(ABC):
     def resized(self, width_px: int, height_px: int) -> Look:
         """The same look in a view of another size."""
 
+    @abstractmethod
+    def finer(self, factor: float) -> Look:
+        """The same part of the photo in a view with so many times the pixels each way."""
+
     def zoomed(self, factor: float, at_xy: tuple[float, float]) -> Look:
         """Nearer or farther; what is at `at_xy` stays there, as far as the limits allow."""
         nearer = self.with_zoom(self.zoom * factor)
@@ -72,6 +80,14 @@ class Look(ABC):
         """(height, width) float32 each: the pixel of the photo that the middle of each pixel of the view shows.
 
         For the picture, in a few milliseconds and to a hundredth of a pixel; beside the photo they lie outside of it.
+        """
+
+    @abstractmethod
+    def reach(self, outline_xy: ArrayLike) -> Reach:
+        """Where in the photo everything lies that is shown within an outline; what is returned may be too much.
+
+        Args:
+            outline_xy: (K, 2) corners of a convex outline, pixels of the view.
         """
 
     def _inside(self, xy_px: Float64) -> Bool:
@@ -135,6 +151,13 @@ class FlatLook(Look):
         u, v = x * xx + y * yx + self.middle_px[0], x * xy + y * yy + self.middle_px[1]
         return u.astype(np.float32), v.astype(np.float32)
 
+    def reach(self, outline_xy: ArrayLike) -> Reach:
+        """See `Look`."""
+        xy = as_points(outline_xy, name="outline_xy", n_columns=2).astype(np.float64)
+        uv = (xy - self._view_middle()) @ self._turn() / self.scale + self.middle_px
+        (u0, v0), (u1, v1) = uv.min(axis=0), uv.max(axis=0)
+        return ((float(u0), float(u1)),), (float(v0), float(v1))
+
     def panned(self, from_xy: tuple[float, float], to_xy: tuple[float, float]) -> FlatLook:
         """See `Look`."""
         step = (np.array(from_xy) - np.array(to_xy)) @ self._turn() / self.scale
@@ -154,6 +177,11 @@ class FlatLook(Look):
         is_whole = self.scale <= self._least() * 1.001
         look = replace(self, width_px=width_px, height_px=height_px)
         return look.with_zoom(look._least() if is_whole else self.scale)
+
+    def finer(self, factor: float) -> FlatLook:
+        """See `Look`."""
+        width, height = round(self.width_px * factor), round(self.height_px * factor)
+        return replace(self, width_px=width, height_px=height, scale=self.scale * width / self.width_px)
 
     def _at(self, middle: Float64) -> FlatLook:
         """The middle of the view stays on the photo; a photo smaller than the view stays in the middle of it."""
@@ -238,6 +266,30 @@ class PanoramaLook(Look):
         v = np.float32(height) * (np.arctan2(y, np.hypot(x, z)) / np.float32(np.pi) + np.float32(0.5))
         return u, v
 
+    def reach(self, outline_xy: ArrayLike) -> Reach:
+        """See `Look`: the cap of the sphere about the outline, widest in longitude where it touches a meridian."""
+        rays = self.rays(outline_xy)
+        axis = rays.mean(axis=0)
+        axis /= np.linalg.norm(axis)
+        # What is convex in a straight view is so on the sphere: its corners are the farthest.
+        angle = float(np.arccos(np.clip((rays @ axis).min(), -1.0, 1.0))) + 1e-6
+        x, y, z = (float(value) for value in axis)
+        down = float(np.arctan2(y, np.hypot(x, z)))
+        width, height = self.camera.params
+        v0, v1 = (height * (side / np.pi + 0.5) for side in (down - angle, down + angle))
+        if abs(down) + angle >= np.pi / 2:  # a pole is in it
+            return ((0.0, float(width)),), (max(v0, 0.0), min(v1, float(height)))
+        half = width * float(np.arcsin(min(np.sin(angle) / np.cos(down), 1.0))) / (2 * np.pi)
+        u = width * (float(np.arctan2(x, z)) / (2 * np.pi) + 0.5)
+        if 2 * half >= width:
+            return ((0.0, float(width)),), (v0, v1)
+        u0, u1 = u - half, u + half
+        if u0 < 0.0:
+            return ((0.0, u1), (u0 + width, float(width))), (v0, v1)
+        if u1 > width:
+            return ((0.0, u1 - width), (u0, float(width))), (v0, v1)
+        return ((u0, u1),), (v0, v1)
+
     def panned(self, from_xy: tuple[float, float], to_xy: tuple[float, float]) -> PanoramaLook:
         """See `Look`."""
         held = self._level(np.array([from_xy]), self.pitch_rad, self.yaw_rad)[0]
@@ -271,6 +323,10 @@ class PanoramaLook(Look):
     def resized(self, width_px: int, height_px: int) -> PanoramaLook:
         """See `Look`."""
         return replace(self, width_px=width_px, height_px=height_px)
+
+    def finer(self, factor: float) -> PanoramaLook:
+        """See `Look`."""
+        return replace(self, width_px=round(self.width_px * factor), height_px=round(self.height_px * factor))
 
     def _focal_px(self) -> float:
         return self.width_px / 2 / float(np.tan(self.fov_rad / 2))

@@ -11,11 +11,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
-from dbh_studio.core.arrays import Float64
+from dbh_studio.core.arrays import Float64, UInt8
 from dbh_studio.core.posed_images import PosedImage
 from dbh_studio.core.tiles import up_in_camera
 from dbh_studio.errors import StudioError
@@ -34,6 +34,7 @@ _LEAST_PX, _MOST_PX = 50, 2000
 _MOST_NUMBER, _MOST_STEPS = 1e8, 20.0
 _PER_STEP = 1.25
 _FRAMES_KEPT = 16
+_MOST_PATH, _MOST_BRUSH_PX = 4000, 200.0
 _HINT_PANORAMA = "Drag to look around, wheel to zoom."
 _HINT_FLAT = "Wheel to zoom, drag to move."
 
@@ -53,6 +54,31 @@ class PhotoMark:
     v_px: float
     label: str
     kind: Literal["mark", "hint", "other"] = "mark"
+
+
+class PhotoOverlay(Protocol):
+    """Something drawn over the photo of a tab pixel by pixel, and painted in it."""
+
+    def draw(self, name: str, look: Look, view: UInt8) -> UInt8:
+        """(h, w, 3) the view with the overlay."""
+
+    def row(self, name: str) -> dict[str, Any] | None:
+        """What the row of buttons under the title shows; None for no row."""
+
+    def hint(self) -> str:
+        """What the pointer does; empty where it looks around."""
+
+    def names(self, names: list[str]) -> list[str]:
+        """Which of the photos are stepped through."""
+
+    def paint(self, name: str, look: Look, points_xy: Float64, radius_px: float, *, begins: bool, ends: bool) -> None:
+        """Part of a stroke: (K, 2) pixels of the view."""
+
+    def box(self, name: str, look: Look, corners_xy: Float64) -> None:
+        """A box was drawn, (2, 2) pixels of the view; both corners the same where it was a click."""
+
+    def left(self, name: str) -> None:
+        """Another photo is shown, or none."""
 
 
 class PhotoView:
@@ -78,12 +104,17 @@ class PhotoView:
         self._along_src: Float64 | None = None
         self._frames: OrderedDict[int, tuple[str, Look]] = OrderedDict()
         self._n_frames = 0
+        self._overlay: PhotoOverlay | None = None
+        self._painted_to = 0
         bridge = tab.bridge
-        bridge.run(resources.files("dbh_studio.ui").joinpath("photo.js").read_text(encoding="utf-8"))
+        for script in ("mask_tools.js", "photo.js"):
+            bridge.run(resources.files("dbh_studio.ui").joinpath(script).read_text(encoding="utf-8"))
         bridge.on("photo-size", self._sized, coalesce=True)
         bridge.on("photo-drag", self._dragged)
         bridge.on("photo-wheel", self._wheeled)
         bridge.on("photo-click", self._clicked)
+        bridge.on("photo-paint", self._painted)
+        bridge.on("photo-box", self._boxed)
         bridge.on("photo-step", self._stepped)
         bridge.on("photo-fly", lambda _: self.fly())
         bridge.on("photo-close", lambda _: self.close())
@@ -104,6 +135,8 @@ class PhotoView:
         self._keep_direction()
         self._cameras = self._tab.session.cameras if self._tab.session is not None else None
         is_other = name != self.image
+        if is_other:
+            self._leave()
         self.image, self._wanted = name, (at_px, zoom_px)
         if is_other:
             self._look = self._pixels = None
@@ -112,6 +145,7 @@ class PhotoView:
         self._run("open", name, self._position(name), "", self.on_pick is not None)
         if self._pixels is None:
             self._run("say", f"Loading {name} …")
+        self.show_row()
         self._tab.client.flush()
         self._tab.cameras.set_current(name)
         # Behind what the person has asked for since: of several photos only the last is read.
@@ -121,6 +155,7 @@ class PhotoView:
         """Take the photo away."""
         if self.image is None:
             return
+        self._leave()
         self.image = self._pixels = self._look = self._cameras = self._along_src = None
         self._frames.clear()
         self._run("close")
@@ -131,6 +166,39 @@ class PhotoView:
         """Draw what `marks_of(photo)` says over every photo that is shown; it is asked each time."""
         self._marks_of = marks_of
         self.refresh()
+
+    def set_overlay(self, overlay: PhotoOverlay | None) -> None:
+        """Draw something over every photo that is shown, or nothing."""
+        if overlay is not self._overlay:
+            self._leave()
+            self._overlay = overlay
+            if self.image is not None:
+                self._run("title", self._position(self.image))
+            self.redraw()
+
+    @property
+    def has_pixels(self) -> bool:
+        """Whether the photo that is open has been read."""
+        return self._pixels is not None
+
+    def view_of(self, look: Look) -> UInt8 | None:
+        """(h, w, 3) the open photo as a look shows it, without anything over it; None while it is being read."""
+        return None if self._pixels is None else self._pixels.render(look)
+
+    def redraw(self) -> None:
+        """Draw the photo and its row of buttons again: what is over it has changed."""
+        if self.image is not None:
+            self.show_row()
+            self._draw()
+
+    def show_row(self) -> None:
+        """Bring the row of buttons in step."""
+        row = None if self._overlay is None or self.image is None else self._overlay.row(self.image)
+        self._run("masks", row)
+
+    def _leave(self) -> None:
+        if self._overlay is not None and self.image is not None:
+            self._overlay.left(self.image)
 
     def refresh(self) -> None:
         """Show the photo as things are now: marks, up direction, the photos of the plot."""
@@ -164,8 +232,13 @@ class PhotoView:
             return None
 
     def _position(self, name: str) -> str:
-        names = self._names()
+        names = self._stepped_names()
         return f"{names.index(name) + 1} / {len(names)}" if name in names else ""
+
+    def _stepped_names(self) -> list[str]:
+        """The photos that ◀ and ▶ go through."""
+        names = self._names()
+        return names if self._overlay is None else self._overlay.names(names)
 
     def _names(self) -> list[str]:
         session = self._tab.session
@@ -231,13 +304,17 @@ class PhotoView:
         self._frames[self._n_frames] = (self.image, self._look)
         while len(self._frames) > _FRAMES_KEPT:
             self._frames.popitem(last=False)
-        source = jpeg_url(self._pixels.render(self._look))
+        view = self._pixels.render(self._look)
+        if self._overlay is not None:
+            view = self._overlay.draw(self.image, self._look, view)
         picks = self.on_pick is not None
-        self._run("frame", self._n_frames, source, self._shown_marks(), self._hint(), picks)
+        self._run("frame", self._n_frames, jpeg_url(view), self._shown_marks(), self._hint(), picks, self._painted_to)
         self._tab.client.flush()
 
     def _hint(self) -> str:
         look = self._look
+        if self._overlay is not None and (hint := self._overlay.hint()):
+            return hint
         text = _HINT_PANORAMA if isinstance(look, PanoramaLook) else _HINT_FLAT
         return f"{text} Click to mark." if self.on_pick is not None else text
 
@@ -295,11 +372,49 @@ class PhotoView:
         if math.isfinite(u) and math.isfinite(v):
             self.on_pick(name, u, v)
 
-    def _stepped(self, payload: Any) -> None:
-        names = self._names()
-        if self.image not in names or payload not in (-1, 1):
+    def _painted(self, payload: Any) -> None:
+        """Part of a stroke: [frame, its number, 0 begins 1 goes on 2 ends 3 both, radius, [x, y, x, y, …]]."""
+        if not isinstance(payload, list) or len(payload) != 5 or not isinstance(payload[4], list):
             return
-        self.open(names[(names.index(self.image) + int(payload)) % len(names)])
+        head, path = _numbers(payload[:4], 4), _numbers(payload[4], len(payload[4]))
+        if head is None or path is None or len(path) % 2 or len(path) > _MOST_PATH:
+            return
+        self._painted_to = int(head[1])
+        name, look = self._frames.get(int(head[0]), (None, None))
+        if self._overlay is not None and name is not None and look is not None and name == self.image:
+            radius = min(max(head[3], 0.5), _MOST_BRUSH_PX)
+            # Farther out than a pointer can be: it would only take long.
+            points = np.clip(np.array(path).reshape(-1, 2), -_MOST_PX, 2 * _MOST_PX)
+            part = int(head[2])
+            self._overlay.paint(name, look, points, radius, begins=part in (0, 3), ends=part in (2, 3))
+            if part < 2 and self._tab.worker.is_behind:
+                return  # the next part is here already
+        self._draw()
+
+    def _boxed(self, payload: Any) -> None:
+        numbers = _numbers(payload, 5)
+        if numbers is None or self._overlay is None:
+            return
+        name, look = self._frames.get(int(numbers[0]), (None, None))
+        if name is not None and look is not None and name == self.image:
+            self._overlay.box(name, look, np.array(numbers[1:]).reshape(2, 2))
+
+    def _stepped(self, payload: Any) -> None:
+        if payload in (-1, 1):
+            self.step(int(payload))
+
+    def step(self, by: int) -> None:
+        """Show the next or the one before of the photos that are stepped through."""
+        every, names = self._names(), self._stepped_names()
+        if self.image not in every or not names:
+            return
+        if self.image in names:
+            self.open(names[(names.index(self.image) + by) % len(names)])
+            return
+        place = {name: index for index, name in enumerate(every)}
+        here = place[self.image]
+        ahead = [name for name in names if (place[name] > here) == (by > 0)]
+        self.open((ahead or names)[0 if by > 0 else -1])
 
 
 def _numbers(payload: Any, count: int) -> list[float] | None:

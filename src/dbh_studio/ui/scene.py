@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -34,7 +34,7 @@ from dbh_studio.ui.viewpoint import clear_side
 
 log = logging.getLogger(__name__)
 
-ColourMode = Literal["Original", "Segmentation (red)", "Segmentation (by tree)", "Height"]
+ColourMode = Literal["Original", "Segmentation (red)", "Segmentation (by tree)", "Height", "Label count", "Steps"]
 COLOUR_MODES: tuple[ColourMode, ...] = get_args(ColourMode)
 
 # A mesh is sent and drawn whole: viser thins nothing.
@@ -46,6 +46,8 @@ _OVERLAY_SIZE, _MARKED_SIZE = 1.25, 1.3
 # Narrower than viser's 75 degrees, at which upright stems near the edge look as if they leaned.
 _FOV_RAD = np.deg2rad(50.0)
 _RING_COLOUR = (20, 60, 190)
+# Modes whose colours come with time: a copy of the cloud each, sent when it is first looked at.
+_LATER: dict[ColourMode, str] = {"Label count": "/count"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,23 @@ class TrunkPicture:
     points: Float32
     rgb: UInt8 | None
     anchor: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class PointLayer:
+    """Points that are switched on and off together.
+
+    Attributes:
+        points: (N, 3) world.
+        rgb: Their colour.
+        size: In sizes of the cloud's points.
+        visible: Whether they are on at first.
+    """
+
+    points: Float32
+    rgb: tuple[int, int, int]
+    size: float
+    visible: bool
 
 
 class SceneView:
@@ -81,6 +100,8 @@ class SceneView:
         self._crowns_on = True
         self._point_size, self._size_factor = 0.02, 1.0
         self._clouds: list[Any] = []
+        self._later: dict[ColourMode, UInt8] = {}
+        self._steps: dict[int, tuple[PointLayer, Any]] = {}
         self._overlays: dict[int, tuple[Trunk, Any, Any]] = {}
         self._label_handles: dict[int, Any] = {}
         self._marked: Any = None
@@ -115,6 +136,7 @@ class SceneView:
             "/height/crown",
             "/red",
             "/tree",
+            "/steps",
             "/labels",
         ):
             self._frames[name] = self._scene.add_frame(name, show_axes=False)
@@ -135,6 +157,7 @@ class SceneView:
                 self._mesh.remove()
             self._mesh, self._mesh_on = None, False
             self._frames, self._clouds, self._overlays, self._label_handles = {}, [], {}, {}
+            self._later, self._steps = {}, {}
             self._display = None
 
     def show_nothing_open(self) -> None:
@@ -159,21 +182,66 @@ class SceneView:
         """Send the cloud in growing chunks; runs on its own thread until done, replaced, or the tab is gone."""
         order = [("/rgb", display.rgb), ("/height", display.by_height)]
         for parent, colours in order if display.has_rgb else order[:1]:
-            for part, is_part in (("low", ~display.is_crown), ("crown", display.is_crown)):
-                chosen = np.flatnonzero(is_part)
-                for number, chunk in enumerate(coarse_first_chunks(len(chosen))):
-                    rows = chosen[chunk]
-                    with self._lock:
-                        if stop.is_set():
-                            return
-                        self._clouds.append(
-                            self._add_points(
-                                f"{parent}/{part}/{number}", display.points[rows], colours[rows], self._point_size
-                            )
+            self._send(parent, display, colours, stop.is_set)
+
+    def _send(self, parent: str, display: DisplayCloud, colours: UInt8, is_stopped: Callable[[], bool]) -> None:
+        for part, is_part in (("low", ~display.is_crown), ("crown", display.is_crown)):
+            chosen = np.flatnonzero(is_part)
+            for number, chunk in enumerate(coarse_first_chunks(len(chosen))):
+                rows = chosen[chunk]
+                with self._lock:
+                    if is_stopped():
+                        return
+                    self._clouds.append(
+                        self._add_points(
+                            f"{parent}/{part}/{number}", display.points[rows], colours[rows], self._point_size
                         )
-                    self._client.flush()
-                    # Room for clicks and text between two chunks on a slow line.
-                    time.sleep(0.03)
+                    )
+                self._client.flush()
+                # Room for clicks and text between two chunks on a slow line.
+                time.sleep(0.03)
+
+    def set_colours(self, mode: ColourMode, colours: UInt8 | None) -> None:
+        """Say how a mode colours the points of the display, or that it cannot any more; see `_LATER`.
+
+        Args:
+            mode: One of those that come with time.
+            colours: (M, 3) of the points of the display.
+        """
+        with self._lock:
+            if self._later.get(mode) is colours:
+                return
+            if colours is None:
+                del self._later[mode]
+            else:
+                self._later[mode] = colours
+            self._remove_later(mode)
+            self._send_later()
+            self._apply_visibility()
+
+    def _remove_later(self, mode: ColourMode) -> None:
+        parent = _LATER[mode]
+        self._clouds = [handle for handle in self._clouds if not handle.name.startswith(f"{parent}/")]
+        frame = self._frames.pop(parent, None)
+        for name in (f"{parent}/low", f"{parent}/crown"):
+            self._frames.pop(name, None)
+        if frame is not None:
+            frame.remove()
+
+    def _send_later(self) -> None:
+        """Send the colours of the mode that is on, where they come with time and have not been sent."""
+        parent, colours, display = _LATER.get(self._mode), self._later.get(self._mode), self._display
+        if parent is None or colours is None or display is None or parent in self._frames:
+            return
+        for name in (parent, f"{parent}/low", f"{parent}/crown"):
+            self._frames[name] = self._scene.add_frame(name, show_axes=False)
+        frame, ended = self._frames[parent], self._stream_stop
+
+        def is_stopped() -> bool:
+            return ended.is_set() or self._frames.get(parent) is not frame
+
+        sending = (parent, display, colours, is_stopped)
+        threading.Thread(target=self._send, args=sending, daemon=True, name="stream").start()
 
     def _add_points(self, name: str, points: Float32, colours: Any, size: float, *, visible: bool = True) -> Any:
         return self._scene.add_point_cloud(
@@ -242,25 +310,50 @@ class SceneView:
                     "/ring", segments, _RING_COLOUR, thickness=5.0, thickness_units="screen"
                 )
 
+    # ---- the steps of the search
+
+    def show_steps(self, layers: Mapping[int, PointLayer]) -> None:
+        """Put the points of every step in place of those sent before; seen in the mode Steps."""
+        with self._lock:
+            for _, handle in self._steps.values():
+                handle.remove()
+            self._steps = {}
+            for number, layer in layers.items():
+                size = layer.size * self._point_size
+                handle = self._add_points(f"/steps/{number}", layer.points, layer.rgb, size, visible=layer.visible)
+                self._steps[number] = (layer, handle)
+                self._client.flush()
+            self._apply_visibility()
+
+    def set_step(self, number: int, on: bool) -> None:
+        """Show or hide the points of one step."""
+        with self._lock:
+            if number in self._steps and self._steps[number][1].visible != on:
+                self._steps[number][1].visible = on
+
     # ---- the mesh
 
     def show_mesh(self, mesh: TriangleMesh, world_from_source: Similarity, *, on: bool) -> None:
         """Show the surface the cloud came with in place of the cloud, or the cloud; it is sent when first wanted."""
         with self._lock:
             self._mesh_on = on
-            if self._mesh is None and on:
-                content = glb_of(mesh, world_from_source)
-                self._mesh = self._scene.add_glb("/mesh", content, cast_shadow=False, receive_shadow=False)
-            elif self._mesh is not None:
-                self._mesh.visible = on
-            self._apply_visibility()
+            content = glb_of(mesh, world_from_source) if self._mesh is None and on else None
+            # Together: points in the same place would show through the surface for a moment.
+            with self._client.atomic():
+                if content is not None:
+                    self._mesh = self._scene.add_glb("/mesh", content, cast_shadow=False, receive_shadow=False)
+                elif self._mesh is not None:
+                    self._mesh.visible = on
+                self._apply_visibility()
 
     # ---- how it looks
 
     def set_mode(self, mode: ColourMode) -> None:
         """Switch the colours: visibility messages only, whatever the size of the cloud."""
         self._mode = mode
-        self._apply_visibility()
+        with self._lock:
+            self._send_later()
+            self._apply_visibility()
 
     def set_labels(self, on: bool) -> None:
         """Show or hide the tree numbers."""
@@ -276,15 +369,22 @@ class SceneView:
         if not self._frames or self._display is None:
             return
         by_height = self._mode == "Height" and self._display.has_rgb
+        by_step = self._mode == "Steps" and bool(self._steps)
+        later = _LATER.get(self._mode) if self._mode in self._later else None
         wanted = {
-            "/rgb": not by_height and not self._mesh_on,
+            "/rgb": not by_height and later is None and not by_step and not self._mesh_on,
             "/height": by_height and not self._mesh_on,
             "/rgb/crown": self._crowns_on,
             "/height/crown": self._crowns_on,
             "/red": self._mode == "Segmentation (red)",
             "/tree": self._mode == "Segmentation (by tree)",
+            "/steps": by_step and not self._mesh_on,
             "/labels": self._labels_on,
         }
+        for parent in _LATER.values():
+            if parent in self._frames:
+                wanted[parent] = parent == later and not self._mesh_on
+                wanted[f"{parent}/crown"] = self._crowns_on
         with self._client.atomic():
             for name, visible in wanted.items():
                 if self._frames[name].visible != visible:
@@ -301,6 +401,8 @@ class SceneView:
                 handle.point_size = self._point_size
             for _, red, own in self._overlays.values():
                 red.point_size = own.point_size = _OVERLAY_SIZE * self._point_size
+            for layer, handle in self._steps.values():
+                handle.point_size = layer.size * self._point_size
             if self._marked is not None:
                 self._marked.point_size = _MARKED_SIZE * self._point_size
 

@@ -30,6 +30,8 @@ from dbh_studio.io.reader import SUPPORTED_SUFFIXES
 from dbh_studio.ui.bind import TabWorker, for_each_tab
 from dbh_studio.ui.display_cloud import DisplayCloud
 from dbh_studio.ui.marker_search import MarkerFinds
+from dbh_studio.ui.mask_desk import MaskDesk
+from dbh_studio.ui.mask_jobs import MaskJobs
 from dbh_studio.ui.photo_desk import PhotoDesk
 from dbh_studio.ui.photo_render import PhotoCache
 from dbh_studio.ui.server import StudioServer
@@ -55,6 +57,7 @@ class RunningJob:
     stop: Callable[[], object]
     fraction: float = 0.0
     message: str = ""
+    if_stopped: str = "nothing was changed."
 
 
 class Studio:
@@ -84,6 +87,8 @@ class Studio:
         self._lock = threading.RLock()
         self.photo_cache = PhotoCache()
         self.photos = PhotoDesk(self, run=self.start_job, tell=self._each_tab)
+        self.masks = MaskDesk(self, tell=self._each_tab)
+        self.mask_jobs = MaskJobs(self)
         server.viser.initial_camera.position = (0.0, -20.0, 6.0)
         server.viser.initial_camera.look_at = (0.0, 0.0, 1.0)
         server.viser.gui.main_panel.dock_right()
@@ -141,8 +146,11 @@ class Studio:
             before.close()
         if isinstance(session.saver, Autosave):
             session.saver.subscribe(self._save_status_changed)
-        self._show_job()
+        self.masks.plot_opened()
+        self.mask_jobs.plot_opened()
+        # First: a tab that shows the end of the job shows its step too, and a press meanwhile would be undone.
         self._each_tab(Tab.adopt_session)
+        self._show_job()
         self.photos.plot_opened(session)
         self.measure_missing()
 
@@ -243,7 +251,9 @@ class Studio:
         """Where an uploaded file is kept from now on."""
         return receive(uploaded, self._uploads_folder, allowed_suffixes=self.suffixes())
 
-    def _open(self, running: RunningJob, path: Path, options: dict[str, Any], cancelled: threading.Event) -> None:
+    def _stoppable(self, running: RunningJob, cancelled: threading.Event) -> tuple[Progress, Callable[[Job], object]]:
+        """How work in a thread reports, and how it tells of the child process that Cancel must end."""
+
         def progress(fraction: float, message: str = "") -> None:
             if cancelled.is_set():
                 raise CancelledError
@@ -257,6 +267,43 @@ class Studio:
             running.stop = stop
             if cancelled.is_set():
                 job.cancel()
+
+        return progress, started
+
+    def start_work(
+        self,
+        title: str,
+        work: Callable[[Progress, Callable[[Job], object]], Any],
+        session: Session,
+        done: Callable[[Any], None],
+    ) -> None:
+        """As `start_job`, for work that starts its child process itself, if it needs one: `work(progress, started)`.
+
+        Raises:
+            BusyError: Another job runs.
+        """
+        cancelled = threading.Event()
+        running = RunningJob(title, cancelled.set)
+        progress, started = self._stoppable(running, cancelled)
+
+        def run() -> None:
+            try:
+                result = work(progress, started)
+                self._end(running)
+                if session is self.session:
+                    done(result)
+            except StudioError as error:
+                self._fail(running, error)
+            except Exception:
+                log.exception("%s failed", title)
+                self._fail(running, StudioError("Unexpected error.", "The program's log has the details."))
+            self.measure_missing()
+
+        self._claim(running)
+        threading.Thread(target=run, daemon=True, name="work").start()
+
+    def _open(self, running: RunningJob, path: Path, options: dict[str, Any], cancelled: threading.Event) -> None:
+        progress, started = self._stoppable(running, cancelled)
 
         def read(source: Path, *, progress: Progress) -> Reconstruction:
             return run_job(read_cloud, source, progress=progress, started=started)
@@ -299,8 +346,8 @@ class Studio:
         document = session.document
         call = pipeline.segmentation_call(session, document)
 
-        def done(result: pipeline.SegmentationResult) -> None:
-            before, self.segmentation_notes = self.segmentation_notes, result[2]
+        def done(result: pipeline.Segmentation) -> None:
+            before, self.segmentation_notes = self.segmentation_notes, result.notes
             try:
                 pipeline.apply_segmentation(session, document, result)
             except StudioError:
@@ -347,6 +394,7 @@ class Studio:
         done: Callable[[Any], None],
         *,
         failed: Callable[[StudioError], object] = lambda _: None,
+        if_stopped: str = RunningJob.if_stopped,
     ) -> None:
         """Run `function` in a child process, then `done` with its result if `session` is still the open plot.
 
@@ -370,14 +418,14 @@ class Studio:
 
         job = Job(function, args, on_progress=progress, on_done=finish, on_error=fail)
         # Claimed before it starts: a Cancel pressed while the process is being made counts.
-        running = RunningJob(title, job.cancel)
+        running = RunningJob(title, job.cancel, if_stopped=if_stopped)
         self._claim(running)
         job.start()
 
     def _fail(self, job: RunningJob, error: StudioError) -> None:
         self._end(job)
         if isinstance(error, CancelledError):
-            self._each_tab(lambda tab: tab.worker.notify("Cancelled", f"{job.title}: nothing was changed.", "info"))
+            self._each_tab(lambda tab: tab.worker.notify("Cancelled", f"{job.title}: {job.if_stopped}", "info"))
         else:
             self._each_tab(lambda tab: tab.worker.notify_error(error))
 
@@ -420,6 +468,8 @@ class Studio:
         """Stop the job, save the plot, end the server."""
         self.cancel_job()
         self.photos.close()
+        with contextlib.suppress(StudioError):
+            self.masks.save()
         if self.session is not None:
             self.session.close()
         self.server.stop()

@@ -19,7 +19,9 @@ from dbh_studio.ui import html
 from dbh_studio.ui.bind import SceneClick, TabWorker
 from dbh_studio.ui.bridge import Bridge
 from dbh_studio.ui.camera_layer import CameraLayer
+from dbh_studio.ui.chain_view import ChainView
 from dbh_studio.ui.marking import Marking
+from dbh_studio.ui.mask_paint import MaskTools
 from dbh_studio.ui.panels.base import Panel, set_content
 from dbh_studio.ui.panels.export import ExportPanel
 from dbh_studio.ui.panels.inspect import InspectPanel, row_of
@@ -73,8 +75,10 @@ class Tab:
         self._header = gui.add_html("")
         self._job_box = gui.add_html("", visible=False)
         self.photos = PhotoView(self)
+        self.masks = MaskTools(self)
         self.cameras = CameraLayer(self)
         self.marking = Marking(self)
+        self.chain = ChainView(self)
         self.panels: tuple[Panel, ...] = tuple(
             panel(self) for panel in (OpenPanel, ScalePanel, TrunksPanel, InspectPanel, ExportPanel)
         )
@@ -141,6 +145,7 @@ class Tab:
         self.refresh_trunks()
         self.cameras.refresh()
         self.controls.show_plot()
+        self.chain.plot_sent()
 
     def session_changed(self, change: Change) -> None:
         """Follow one change of the document."""
@@ -157,6 +162,7 @@ class Tab:
         elif change.before is not change.after:
             self.refresh_trunks()
             self.cameras.refresh()
+        self.masks.offer_counts()
         self.photos.refresh()
         if change.before.trunks is not change.after.trunks and len(change.before.trunks) == 0:
             self._trunks_appeared()
@@ -202,6 +208,7 @@ class Tab:
 
     def refresh(self) -> None:
         """Bring header, active panel and buttons in step."""
+        self.chain.follow()
         with self.client.atomic():
             self.refresh_header()
             for panel in self.panels:
@@ -304,7 +311,7 @@ class Tab:
                 rows.append(html.TableRow(trunk_id, None, "", None, "not measured yet"))
             else:
                 result = session.measurement(trunk_id, document=document).result
-                rows.append(row_of(trunk_id, result, species=record.species, note=record.note))
+                rows.append(row_of(trunk_id, result, species=record.species, note=record.remark))
         return rows
 
     # ---- what a person does
@@ -332,6 +339,8 @@ class Tab:
     def _scene_clicked(self, click: SceneClick) -> None:
         session, display = self.session, self.studio.display
         if session is None or display is None or self.marking.scene_clicked(click):
+            return
+        if not self.marking.is_on and self.chain.clicked(click):
             return
         hit = display.picking.pick(click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
         if self.cameras.click(click, hit.depth if hit is not None else np.inf) or hit is None:
@@ -386,7 +395,7 @@ class Tab:
         self.scene.fly_to(target)
 
     def _undo_pressed(self) -> None:
-        if self.marking.take_back():  # the last thing that was done
+        if self.marking.take_back() or self.masks.take_back():  # the last thing that was done
             return
         # A key pressed once too often is no error.
         if self.session is not None and self.session.can_undo:

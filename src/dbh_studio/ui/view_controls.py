@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from dbh_studio.core.arrays import UInt8
 from dbh_studio.errors import StudioError
 from dbh_studio.ui import html
 from dbh_studio.ui.panels.base import set_value, set_visible
@@ -17,7 +18,11 @@ _MODE_TITLES: dict[ColourMode, str] = {
     "Segmentation (red)": "Trunks red",
     "Segmentation (by tree)": "By tree",
     "Height": "Height",
+    "Label count": "Label count",
+    "Steps": "Steps",
 }
+# These colours come of work that is done later, if at all.
+_LATER = frozenset({"Label count", "Steps"})
 _LOOKS = (
     ("plot", "Plot", "The whole plot (H)"),
     ("top", "Top", "From above, north up (T)"),
@@ -31,6 +36,7 @@ class ViewControls:
 
     def __init__(self, tab: Tab) -> None:
         self._tab = tab
+        self._there: set[ColourMode] = set()
         gui, worker, scene = tab.client.gui, tab.worker, tab.scene
         with gui.add_folder("View options", expand_by_default=False):
             labels = gui.add_checkbox("Tree numbers", True)
@@ -54,14 +60,42 @@ class ViewControls:
     def set_mode(self, mode: ColourMode) -> None:
         """Switch the colours."""
         self._tab.view.mode = mode
+        self._tab.chain.mode_chosen(mode)
         self._tab.scene.set_mode(mode)
         self._show_bar()
         self._tab.client.flush()  # not with the next heap: somebody waits for it
 
     def next_mode(self) -> None:
         """The colours after those on screen, round and round."""
-        at = COLOUR_MODES.index(self._tab.view.mode)
-        self.set_mode(COLOUR_MODES[(at + 1) % len(COLOUR_MODES)])
+        modes = self._modes()
+        at = modes.index(self._tab.view.mode) if self._tab.view.mode in modes else -1
+        self.set_mode(modes[(at + 1) % len(modes)])
+
+    def offer(self, mode: ColourMode, colours: UInt8 | None) -> None:
+        """Offer colours that come with time, (M, 3) of the points of the display; None where they are gone."""
+        if colours is not None:
+            self._there.add(mode)
+        elif mode in self._there:
+            self._there.discard(mode)
+            if self._tab.view.mode == mode:
+                self._tab.view.mode = "Original"
+                self._tab.scene.set_mode("Original")
+        else:
+            return
+        self._tab.scene.set_colours(mode, colours)
+        self._show_bar()
+
+    def offer_steps(self, is_there: bool) -> None:
+        """Offer to colour by the steps of the last search, or no more."""
+        if is_there == ("Steps" in self._there):
+            return
+        self._there ^= {"Steps"}
+        if not is_there and self._tab.view.mode == "Steps":
+            self.set_mode("Original")
+        self._show_bar()
+
+    def _modes(self) -> list[ColourMode]:
+        return [mode for mode in COLOUR_MODES if mode not in _LATER or mode in self._there]
 
     def show_plot(self) -> None:
         """Bring options and picture in step with a plot that has just been sent."""
@@ -72,16 +106,19 @@ class ViewControls:
         self._tab.scene.set_crowns(bool(self._crowns.value))
         if has_mesh and self._mesh.value:
             self._mesh_chosen(True)
+        self._tab.masks.offer_counts()
 
     def show_cameras(self, has_cameras: bool) -> None:
         """Offer to hide the photos' places where there are any."""
         set_visible(self._cameras, has_cameras)
 
     def _show_bar(self) -> None:
-        self._tab.bridge.run(html.view_bar_js(tuple(_MODE_TITLES.items()), self._tab.view.mode, _LOOKS))
+        titles = tuple((mode, _MODE_TITLES[mode]) for mode in self._modes())
+        self._tab.bridge.run(html.view_bar_js(titles, self._tab.view.mode, _LOOKS))
+        self._tab.masks.show_legend()
 
     def _mode_chosen(self, payload: Any) -> None:
-        if payload in COLOUR_MODES:
+        if payload in self._modes():
             self.set_mode(payload)
 
     def _look_chosen(self, payload: Any) -> None:

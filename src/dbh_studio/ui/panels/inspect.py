@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import viser
@@ -10,19 +10,35 @@ import viser
 from dbh_studio.app import commands
 from dbh_studio.app.document import Document
 from dbh_studio.app.session import Session
-from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.core.dbh import DbhEstimate, Refusal
 from dbh_studio.core.inventory import TREE_STATUSES, TreeRecord
+from dbh_studio.core.stem_profile import ProfilePoint, breast_height_flag
 from dbh_studio.errors import CommandError
 from dbh_studio.settings import CurveName
 from dbh_studio.ui import html
+from dbh_studio.ui.candidates_section import flag_html
 from dbh_studio.ui.forms import SettingsForm
 from dbh_studio.ui.panels.base import Panel, set_content, set_value, set_visible
+from dbh_studio.ui.profile_svg import profile_svg
 from dbh_studio.ui.section_svg import section_svg
 
 _STATUS_TITLES = {"": "not said", "live": "live", "dead": "dead"}
 _BREAST_HEIGHTS = {"1.30 m (Europe, Canada)": 1.30, "1.37 m (USA)": 1.37, "1.40 m (New Zealand)": 1.40}
 _OWN_HEIGHT = "own, set below"
-_FIRST = ("curve", "breast_height_m", "band_below_m", "band_above_m", "definition", "min_coverage_deg")
+_FIRST = (
+    "curve", "breast_height_m", "definition", "min_coverage_deg", "max_half_width", "band_below_m", "band_above_m",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """One tree looked at more closely, in one state of the plot."""
+
+    document: Document
+    trunk_id: int
+    result: DbhEstimate | Refusal
+    profile: tuple[ProfilePoint, ...]
+    height_m: float
 
 
 class InspectPanel(Panel):
@@ -42,7 +58,12 @@ class InspectPanel(Panel):
             "Breast height", (*_BREAST_HEIGHTS, _OWN_HEIGHT), hint="of every tree; takes effect at once"
         )
         worker.on_update(self._height, self._height_chosen)
+        self._method = gui.add_dropdown(
+            "Measured by", tuple(html.CURVE_TITLES.values()), hint="every tree of the plot; takes effect at once"
+        )
+        worker.on_update(self._method, self._method_chosen)
         self.tab.bridge.on("curve", self._curve_chosen)
+        self.tab.bridge.on("compare", self._compare)
         with gui.add_folder("About this tree", expand_by_default=False, visible=False) as self._about:
             self._species = gui.add_text("Species", "")
             self._status = gui.add_dropdown("Status", tuple(_STATUS_TITLES[status] for status in TREE_STATUSES))
@@ -61,6 +82,7 @@ class InspectPanel(Panel):
         self._form.show(measure)
         known = {metres: title for title, metres in _BREAST_HEIGHTS.items()}
         set_value(self._height, known.get(measure.breast_height_m, _OWN_HEIGHT))
+        set_value(self._method, html.CURVE_TITLES[measure.curve])
         self.refresh_card()
         self.refresh_table()
 
@@ -77,8 +99,14 @@ class InspectPanel(Panel):
         if stem is None:
             set_content(self._card, html.waiting_card(selected))
         else:
-            picture = section_svg(stem.result, curve=document.settings.measure.curve)
-            set_content(self._card, html.tree_card(selected, stem.result, section=picture))
+            compared = self._compared
+            result, profile = stem.result, ""
+            if compared is not None and compared.document is document and compared.trunk_id == selected:
+                result, profile = compared.result, profile_svg(compared.profile, height_m=compared.height_m)
+            picture = section_svg(result, curve=document.settings.measure.curve) + profile
+            scale = html.scale_words(document.scale)
+            card = html.tree_card(selected, result, section=picture, scale=scale)
+            set_content(self._card, card + flag_html(selected, document.record(selected).flag))
         self._show_record(document, selected)
 
     def refresh_table(self) -> None:
@@ -92,6 +120,23 @@ class InspectPanel(Panel):
             )
         self.tab.bridge.run(html.select_row_js(view.selected))
 
+    def _compare(self, _: Any = None) -> None:
+        """Measure the chosen tree by every method and all along the stem, for the pictures."""
+        session, selected = self.tab.require_session(), self._selected()
+        document = session.document
+        if not document.scale.is_known or selected not in document.trunks:
+            return
+        result = session.compared(selected, document=document).result
+        profile = session.profile(selected, document=document)
+        height_m = document.settings.measure.breast_height_m
+        if isinstance(result, DbhEstimate):
+            flag = breast_height_flag(profile, height_m, result.diameters[result.definition])
+            if flag is not None:
+                result = replace(result, flags=(*result.flags, flag.words), flag_codes=(*result.flag_codes, flag.code))
+        self._compared = _Compared(document, selected, result, profile, height_m)
+        self.refresh_card()
+
+    _compared: _Compared | None = None
     _rows_shown: object = None
     _record_shown: tuple[Session, int, TreeRecord] | None = None
 
@@ -140,7 +185,10 @@ class InspectPanel(Panel):
 
     def _curve_chosen(self, curve: Any) -> None:
         if curve in get_args(CurveName):
-            self._change(f"Measure by the {html.CURVE_TITLES[curve]} curve", curve=curve)
+            self._change(f"Measure by: {html.CURVE_TITLES[curve]}", curve=curve)
+
+    def _method_chosen(self, title: str) -> None:
+        self._curve_chosen(next(name for name, known in html.CURVE_TITLES.items() if known == title))
 
     def _height_chosen(self, title: str) -> None:
         if title in _BREAST_HEIGHTS:

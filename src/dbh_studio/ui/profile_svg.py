@@ -1,0 +1,54 @@
+"""The stem's diameters over height as an inline SVG: values, their 90 % intervals, and breast height."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dbh_studio.core.stem_profile import ProfilePoint
+
+_WIDTH, _HEIGHT = 340, 170
+_LEFT, _RIGHT, _TOP, _BOTTOM = 40, 10, 10, 26
+_CURVE, _HERE = "#1864ab", "#2b8a3e"
+
+
+def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float) -> str:
+    """The picture; empty with fewer than two diameters.
+
+    Args:
+        profile: From `core.stem_profile.stem_profile`.
+        height_m: Breast height, which is marked.
+    """
+    rows = [(point.height_m, point.diameter) for point in profile if point.diameter is not None]
+    if len(rows) < 2:
+        return ""
+    ends = [end for _, diameter in rows for end in (diameter.low_cm, diameter.high_cm) if end is not None]
+    values = [diameter.value_cm for _, diameter in rows]
+    # An end of a hardly seen height must not squeeze all others.
+    low, high = max(min([*ends, *values]), 0.6 * min(values)), min(max([*ends, *values]), 1.5 * max(values))
+    bottom, top = min(rows[0][0], height_m), max(rows[-1][0], height_m)
+
+    def x(height: float) -> float:
+        return _LEFT + (_WIDTH - _LEFT - _RIGHT) * (height - bottom) / max(top - bottom, 0.1)
+
+    def y(value_cm: float) -> float:
+        inside = min(max(value_cm, low), high)
+        return _HEIGHT - _BOTTOM - (_HEIGHT - _TOP - _BOTTOM) * (inside - low) / max(high - low, 0.1)
+
+    bars = "".join(
+        f"M{x(height):.1f} {y(diameter.low_cm):.1f}V{y(diameter.high_cm):.1f}"
+        for height, diameter in rows
+        if diameter.low_cm is not None and diameter.high_cm is not None
+    )
+    line = " ".join(f"{x(height):.1f},{y(diameter.value_cm):.1f}" for height, diameter in rows)
+    text = 'font-size="12" font-family="sans-serif" fill="#495057"'
+    return (
+        f'<svg class="dbh-profile" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="Diameters along the stem">'
+        f'<path data-intervals d="{bars}" stroke="{_CURVE}" stroke-width="3" opacity="0.35"/>'
+        f'<polyline data-profile points="{line}" fill="none" stroke="{_CURVE}" stroke-width="2"/>'
+        f'<path d="M{x(height_m):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{_HERE}" stroke-dasharray="4 3"/>'
+        f'<text x="2" y="{_TOP + 10}" {text}>{high:.0f} cm</text>'
+        f'<text x="2" y="{_HEIGHT - _BOTTOM}" {text}>{low:.0f} cm</text>'
+        f'<text x="{_LEFT}" y="{_HEIGHT - 8}" {text}>{bottom:.1f} m</text>'
+        f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 8}" text-anchor="end" {text}>{top:.1f} m above ground</text>'
+        "</svg>"
+    )
