@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from dbh_studio.errors import SettingError
 
-CurveName = Literal["fourier", "ellipse", "bspline"]
+CurveName = Literal["shrinkage", "circle", "fourier", "ellipse", "bspline"]
 
 
 def setting(default: Any, title: str, *, unit: str = "", help: str = "", **bounds: Any) -> Any:
@@ -83,6 +83,11 @@ class GroundSettings(SettingsModel):
     )
     plane_iterations: int = setting(1000, "Plane RANSAC iterations", ge=10, le=100_000)
 
+    @classmethod
+    def paper(cls) -> GroundSettings:
+        """The paper's single plane."""
+        return cls(method="plane")
+
 
 class TrunkSettings(SettingsModel):
     """How trunks are found: a geometric detector or given labels, then the paper's chain."""
@@ -143,6 +148,17 @@ class TrunkSettings(SettingsModel):
         "Small clusters",
         help="evidence: Otsu's threshold on size, but stems proven by rings stay; otsu: the paper; keep: all stay",
     )
+    smallest_cluster_points: int = setting(
+        0,
+        "Smallest cluster",
+        unit="points",
+        ge=0,
+        le=100_000_000,
+        help="a smaller cluster is no trunk; 0: Otsu's threshold says what is small",
+    )
+    part_touching: bool = setting(
+        True, "Part stems that touch", help="by their rings; off as in the paper, for masks that tell them apart"
+    )
     expand_distance_m: float = setting(
         0.06, "Expansion distance", unit="m", ge=0.0, le=1.0, help="points this near a cluster join it"
     )
@@ -152,13 +168,23 @@ class TrunkSettings(SettingsModel):
         True, "Take over tree ids", help="use treeID, tree_id, PredInstance … where the cloud has them"
     )
 
+    @classmethod
+    def paper(cls) -> TrunkSettings:
+        """The paper's chain, for candidates from masks: size alone judges clusters, and rings tell nothing."""
+        return cls(small_clusters="otsu", part_touching=False, trunk_top_m=40.0, use_existing_ids=False)
+
 
 class MeasureSettings(SettingsModel):
     """How a diameter is measured."""
 
     ascending = (("min_diameter_cm", "max_diameter_cm"),)
 
-    curve: CurveName = setting("fourier", "Curve", help="the paper's three; it found Fourier the most robust")
+    curve: CurveName = setting(
+        "shrinkage",
+        "Method",
+        help="shrinkage: a closed curve that shrinks to a circle where nothing was seen; circle: a robust circle; both "
+        "with an interval. fourier, ellipse, bspline: the paper's three, which have none",
+    )
     breast_height_m: float = setting(
         1.30,
         "Breast height",
@@ -176,10 +202,17 @@ class MeasureSettings(SettingsModel):
         help="0.08 below and 0.22 above 1.30 m is the paper's 1.22-1.52 m",
     )
     band_above_m: float = setting(0.22, "Band above", unit="m", ge=0.01, le=1.0)
-    definition: Literal["curve", "tape", "area"] = setting(
-        "curve",
+    definition: Literal["tape", "curve", "area"] = setting(
+        "tape",
         "Diameter",
-        help="curve: perimeter/π (the paper); tape: convex girth/π, what a tape reads; area: of the equal circle",
+        help="tape: convex girth/π, what a tape reads; curve: perimeter/π (the paper); area: of the equal circle",
+    )
+    max_half_width: float = setting(
+        0.40,
+        "Widest interval",
+        gt=0.01,
+        le=2.0,
+        help="half the 90 % interval, relative; a diameter known less well is not given (shrinkage, circle)",
     )
     ransac_samples: int = setting(50, "RANSAC sample", unit="points", ge=6, le=1000)
     ransac_tolerance_m: float = setting(0.05, "RANSAC tolerance", unit="m", ge=0.002, le=0.5)
@@ -215,6 +248,23 @@ class MeasureSettings(SettingsModel):
         le=10.0,
         help="the RANSAC tolerance is at most this share of the radius; 0 keeps it fixed (the paper)",
     )
+    roundness: float = setting(
+        0.016, "Roundness", unit="radii", gt=0.0, le=0.5, help="shrinkage: expected size of an oval; smaller is rounder"
+    )
+    bark_share: float = setting(
+        0.007,
+        "Bark under the tape",
+        ge=0.0,
+        le=0.1,
+        help="shrinkage, circle: a tape lies on the bark's ridges, a curve runs through their middle; relative",
+    )
+    bloat_chance: float = setting(
+        0.05,
+        "Chance of bloat",
+        ge=0.0,
+        lt=1.0,
+        help="shrinkage, circle: that bark is smeared outwards, before looking; 0: never",
+    )
     min_diameter_cm: float = setting(2.0, "Smallest diameter", unit="cm", ge=0.5, le=100.0)
     max_diameter_cm: float = setting(300.0, "Largest diameter", unit="cm", ge=10.0, le=1500.0)
     min_points: int = setting(30, "Fewest points in the band", ge=8, le=100_000)
@@ -222,6 +272,11 @@ class MeasureSettings(SettingsModel):
         90.0, "Smallest arc seen", unit="°", ge=0.0, le=360.0, help="with less of the ring seen no diameter is given"
     )
     seed: int = setting(0, "Random seed", ge=0, le=2**31 - 1)
+
+    @classmethod
+    def paper(cls) -> MeasureSettings:
+        """The paper's way, as far as it says: Fourier, perimeter/π, no gate, a fixed tolerance, the mean as origin."""
+        return cls(curve="fourier", definition="curve", ring_gate=0.0, tolerance_share=0.0, polar_origin="centroid")
 
 
 class EstimatorSettings(SettingsModel):
@@ -240,7 +295,7 @@ class EstimatorSettings(SettingsModel):
         "Diameter",
         help="tape: convex girth/π; curve: perimeter/π (the paper); area: of the equal circle",
     )
-    breast_height_m: float = setting(1.30, "Breast height", unit="m", ge=0.3, le=5.0)
+    breast_height_m: float = setting(1.30, "Height of measurement", unit="m", ge=0.1, le=100.0)
     below_m: float = setting(
         0.50, "Stem used below", unit="m", ge=0.05, le=2.0, help="axis and taper are found from this stretch of stem"
     )
@@ -278,6 +333,9 @@ class EstimatorSettings(SettingsModel):
     )
     max_half_width: float = setting(
         0.40, "Widest interval", gt=0.01, le=2.0, help="half the 90 % interval, relative; wider is refused"
+    )
+    max_depth_noise: float = setting(
+        0.15, "Most noise of an arc", gt=0.0, le=10.0, help="scatter over the depth of the arc seen; more is refused"
     )
     min_diameter_cm: float = setting(2.0, "Smallest diameter", unit="cm", ge=0.5, le=100.0)
     max_diameter_cm: float = setting(250.0, "Largest diameter", unit="cm", ge=10.0, le=1500.0)
@@ -376,10 +434,27 @@ class VoteSettings(SettingsModel):
         512, "Depth map", unit="px", help="pixels across a quarter of the horizon"
     )
 
+    tell_apart: bool = setting(
+        True,
+        "Masks tell trunks apart",
+        help="where they have numbers: a trunk with two masks in several photos is cut, fragments are joined",
+    )
+    second_look: bool = setting(
+        True, "Look for stems by shape too", help="stems that no mask shows are offered, trunks without a stem flagged"
+    )
+
     @classmethod
     def paper(cls) -> VoteSettings:
         """The paper's rule: every photo, nothing hides anything, a label count of one is enough."""
-        return cls(rule="count", min_count=1, occlusion=False, weighting="none", max_distance_m=1000.0, edge_px=0)
+        return cls(
+            rule="count",
+            min_count=1,
+            occlusion=False,
+            weighting="none",
+            max_distance_m=1000.0,
+            edge_px=0,
+            tell_apart=False,
+        )
 
 
 class ModelRunSettings(SettingsModel):

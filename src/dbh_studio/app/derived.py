@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar, get_args
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -22,9 +22,11 @@ from dbh_studio.core.inventory import Inventory, InventoryRow, MapPosition, inve
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.core.trunks import Trunk
+from dbh_studio.settings import CurveName
 
 if TYPE_CHECKING:
     from dbh_studio.core.ground import GroundModel
+    from dbh_studio.core.stem_profile import ProfilePoint
     from dbh_studio.stages.measure import StemMeasurement
 
 Value = TypeVar("Value")
@@ -88,7 +90,7 @@ def _ground_key(document: Document) -> Hashable:
 
 
 def _measure_key(document: Document) -> Hashable:
-    return _ground_key(document), document.settings.measure
+    return _ground_key(document), document.settings.measure, document.scale.relative_sd
 
 
 class Derived:
@@ -199,8 +201,46 @@ class Derived:
             trunk_id=trunk_id,
             ground=self.ground(document),
             settings=document.settings.measure,
+            scale_sd=document.scale.relative_sd,
         )
         return self.put_measurement(document, measurement)
+
+    def compared(self, document: Document, trunk_id: int) -> StemMeasurement:
+        """The diameter of one stem with every method's curve beside it; measured anew.
+
+        Raises:
+            KeyError: There is no such trunk.
+        """
+        trunk = document.trunks[trunk_id]
+        if not document.scale.is_known:
+            return _unscaled(trunk)
+        measure_trunk = self._measure_trunk or _default_measure_trunk()
+        return measure_trunk(
+            self.points_world(document)[trunk.points],
+            trunk_id=trunk_id,
+            ground=self.ground(document),
+            settings=document.settings.measure,
+            curves=get_args(CurveName),
+            scale_sd=document.scale.relative_sd,
+        )
+
+    def profile(self, document: Document, trunk_id: int) -> tuple[ProfilePoint, ...]:
+        """Diameters along one stem; none where the cloud has no scale or the stem no ground.
+
+        Raises:
+            KeyError: There is no such trunk.
+        """
+        z_ground_m = self.measurement(document, trunk_id).z_ground_m
+        if not np.isfinite(z_ground_m):
+            return ()
+        from dbh_studio.stages.measure import profile_trunk
+
+        return profile_trunk(
+            self.points_world(document)[document.trunks[trunk_id].points],
+            z_ground_m=z_ground_m,
+            settings=document.settings.measure,
+            scale_sd=document.scale.relative_sd,
+        )
 
     def measurements(self, document: Document, progress: Progress = ignore_progress) -> tuple[StemMeasurement, ...]:
         """All stems, in order of id."""

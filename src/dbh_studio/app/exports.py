@@ -92,7 +92,9 @@ def export_plot(
     for path in paths.values():
         check_not_source(path, document.source.used)
         if path.exists() and not request.overwrite:
-            raise FileError(path, "There is such a file already.", "Choose another folder, or say that it may be replaced.")
+            raise FileError(
+                path, "There is such a file already.", "Choose another folder, or say that it may be replaced."
+            )
     share = 0.5 / len(wanted)
     inventory = session.inventory(subprogress(progress, 0.0, 0.5), document=document)
     writer = _Writer(session, document, request, inventory)

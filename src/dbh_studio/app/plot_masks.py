@@ -192,7 +192,7 @@ def masks_that_vote(store: MaskStore, posed: PosedImages | None = None, *, only_
     of = "" if photos is None else f" of {len(photos):,} photos"
     notes = [f"{len(voting):,} masks{of} are kept beside the plot and vote."]
     for count, text in (
-        (n_painted, "of them were painted by hand."),
+        (n_painted, "of them painted by hand."),
         (n_rejected, "were rejected and do not vote."),
         (n_waiting, "were not accepted yet and do not vote."),
         (n_strange, "belong to photos that are not here, or have changed since, and do not vote."),

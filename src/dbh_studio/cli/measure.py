@@ -8,7 +8,7 @@ import io
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from dbh_studio.cli.common import (
     add_cloud_options,
@@ -25,11 +25,16 @@ from dbh_studio.errors import FileError, StudioError, UnscaledCloudError
 
 if TYPE_CHECKING:
     from dbh_studio.core.arrays import Float64
+    from dbh_studio.core.dbh import DbhEstimate, Refusal
     from dbh_studio.settings import MeasureSettings
 
+PROFILE_COLUMNS = ("file", "height_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "coverage_deg", "reason")
 COLUMNS = (
-    "file", "dbh_cm", "dbh_method", "dbh_definition", "hom_m", "coverage_deg", "max_gap_deg", "rmse_mm", "n_points",
-    "lean_deg", "quality", "reason", "remedy", "flags", "fourier_cm", "ellipse_cm", "bspline_cm",
+    "file", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "dbh_method", "dbh_definition",
+    "dbh_tape_cm", "dbh_tape_lo_cm", "dbh_tape_hi_cm", "dbh_curve_cm", "dbh_curve_lo_cm", "dbh_curve_hi_cm",
+    "dbh_area_cm", "dbh_area_lo_cm", "dbh_area_hi_cm", "hom_m", "coverage_deg", "max_gap_deg", "rmse_mm", "n_points",
+    "lean_deg", "taper_cm_per_m", "quality", "reason", "remedy", "flags",
+    "shrinkage_cm", "circle_cm", "fourier_cm", "ellipse_cm", "bspline_cm",
 )  # fmt: skip
 
 
@@ -53,6 +58,12 @@ def add_commands(commands: Any) -> None:
         help="height of the ground in the files, metres; 0 where z is already a height; without it the ground "
         "is each stem's own lowest point",
     )
+    measure.add_argument(
+        "--profile",
+        type=path_argument,
+        metavar="FILE",
+        help="also write the diameters every 10 cm along each stem there, as CSV",
+    )
     add_cloud_options(measure)
     add_settings_options(measure, only_measure=True)
     measure.add_argument("--json", action="store_true", help="print JSON")
@@ -69,18 +80,25 @@ def measure_files(options: argparse.Namespace) -> int:
         from dbh_studio.io.inventory_csv import check_not_source
 
         check_not_source(options.csv, options.stems)
-    rows, errors = [], []
+    if options.profile is not None:
+        from dbh_studio.io.inventory_csv import check_not_source
+
+        check_not_source(options.profile, options.stems)
+    rows, errors, profile = [], [], []
     with progress_for(options) as progress:
         for number, path in enumerate(options.stems):
             progress(number / len(options.stems), path.name)
-            row, error = _row(path, options, settings)
+            row, error, along = _row(path, options, settings)
             rows.append(row)
+            profile += along
             if error is not None:
                 errors.append(error)
                 progress.finish()
                 told = error if isinstance(error, FileError) else f"{path.name}: {error}"
                 print(f"dbh-studio: {plain(str(told))}", file=sys.stderr)
     _write(rows, options)
+    if options.profile is not None:
+        _write_csv(options.profile, _csv(profile, PROFILE_COLUMNS), option="--profile")
     if any(isinstance(error, UnscaledCloudError) for error in errors):
         return 3
     return 1 if errors else 0
@@ -88,14 +106,16 @@ def measure_files(options: argparse.Namespace) -> int:
 
 def _row(
     path: Path, options: argparse.Namespace, settings: MeasureSettings
-) -> tuple[dict[str, Any], StudioError | None]:
+) -> tuple[dict[str, Any], StudioError | None, list[dict[str, Any]]]:
+    """The row of a file, why there is none, and the rows of its profile."""
     try:
-        return {"file": str(path)} | _measure_file(path, options, settings), None
+        row, along = _measure_file(path, options, settings)
+        return {"file": str(path)} | row, None, [{"file": str(path)} | point for point in along]
     except UnscaledCloudError:
         error: StudioError = unscaled_error()
     except StudioError as other:
         error = other
-    return {"file": str(path), "reason": error.problem, "remedy": error.remedy}, error
+    return {"file": str(path), "reason": error.problem, "remedy": error.remedy}, error, []
 
 
 def _write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
@@ -103,15 +123,15 @@ def _write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
         # Every row has every column, so that a reader need not ask.
         print(json.dumps([dict.fromkeys(COLUMNS) | row for row in rows], indent=2))
     if options.csv is not None:
-        _write_csv(options.csv, _csv(rows))
+        _write_csv(options.csv, _csv(rows, COLUMNS), option="--csv")
         if not options.json and not options.quiet:
             n_measured = sum("dbh_cm" in row for row in rows)
             print(plain(f"{counted(len(rows), 'stem')}, {n_measured} with a diameter: {options.csv}"))
     elif not options.json:
-        sys.stdout.write(_csv(rows))
+        sys.stdout.write(_csv(rows, COLUMNS))
 
 
-def _write_csv(path: Path, text: str) -> None:
+def _write_csv(path: Path, text: str, *, option: str) -> None:
     from dbh_studio.io.atomic import atomic_file
 
     try:
@@ -120,15 +140,15 @@ def _write_csv(path: Path, text: str) -> None:
             file.write(text.encode("utf-8", "replace"))
     except OSError as error:
         raise FileError(
-            path, f"The table could not be written ({error.strerror or error}).", "Choose another place for --csv."
+            path, f"The table could not be written ({error.strerror or error}).", f"Choose another place for {option}."
         ) from error
 
 
-def _csv(rows: list[dict[str, Any]]) -> str:
+def _csv(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> str:
     from dbh_studio.io.inventory_csv import defused
 
     stream = io.StringIO()
-    writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
+    writer = csv.DictWriter(stream, columns, restval="", lineterminator="\n")
     writer.writeheader()
     # None is written as an empty cell.
     writer.writerows(
@@ -137,18 +157,23 @@ def _csv(rows: list[dict[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def _measure_file(path: Path, options: argparse.Namespace, settings: MeasureSettings) -> dict[str, Any]:
+def _measure_file(
+    path: Path, options: argparse.Namespace, settings: MeasureSettings
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The row of one file, and the rows of its profile where that is wanted."""
     from dbh_studio.core.dbh import CurveFit, DbhEstimate, measure_stem
+    from dbh_studio.settings import CurveName
 
     points = _points_of(path, options)
     base = float(points[:, 2].min()) if options.ground_z is None else options.ground_z
     points[:, 2] -= base
-    result = measure_stem(points, settings=settings)
+    result = measure_stem(points, settings=settings, curves=get_args(CurveName))
     row: dict[str, Any]
     if isinstance(result, DbhEstimate):
         section = result.section
         row = {
             "dbh_cm": round(result.dbh_cm, 2),
+            **_intervals(result),
             "dbh_method": result.curve,
             "dbh_definition": result.definition,
             "hom_m": round(section.hom_m, 3),
@@ -156,7 +181,8 @@ def _measure_file(path: Path, options: argparse.Namespace, settings: MeasureSett
             "max_gap_deg": round(section.max_gap_deg, 1),
             "rmse_mm": round(result.rmse_mm, 1),
             "n_points": result.n_points,
-            "lean_deg": None if section.axis_source == "vertical" else round(section.lean_deg, 1),
+            "lean_deg": round(section.lean_deg, 1) if section.axis_source == "stem" else None,
+            "taper_cm_per_m": None if result.taper_cm_per_m is None else round(result.taper_cm_per_m, 2),
             "quality": result.quality,
             "flags": "; ".join(result.flags),
         }
@@ -165,7 +191,41 @@ def _measure_file(path: Path, options: argparse.Namespace, settings: MeasureSett
     for name, fit in result.fits.items():
         if isinstance(fit, CurveFit):
             row[f"{name}_cm"] = round(100 * fit.diameter_m(settings.definition), 2)
-    return row
+    return row, _profile(points, result, row, settings) if options.profile is not None else []
+
+
+def _profile(
+    points: Float64, result: DbhEstimate | Refusal, row: dict[str, Any], settings: MeasureSettings
+) -> list[dict[str, Any]]:
+    """The rows of a stem's profile; what it says against the diameter is added to the flags in `row`."""
+    from dbh_studio.core.dbh import DbhEstimate
+    from dbh_studio.core.stem_profile import breast_height_flag, stem_profile
+
+    profile = stem_profile(points, settings=settings)
+    if isinstance(result, DbhEstimate):
+        flag = breast_height_flag(profile, result.hom_m, result.diameters[result.definition])
+        row["flags"] = "; ".join(filter(None, (row["flags"], flag.words if flag is not None else "")))
+    rows = []
+    for point in profile:
+        cells: dict[str, Any] = {"height_m": f"{point.height_m:.2f}", "reason": point.reason}
+        cells["coverage_deg"] = None if point.arc_deg is None else round(point.arc_deg, 1)
+        if point.diameter is not None and point.diameter.low_cm is not None and point.diameter.high_cm is not None:
+            cells["dbh_cm"] = round(point.diameter.value_cm, 2)
+            cells["dbh_lo_cm"], cells["dbh_hi_cm"] = round(point.diameter.low_cm, 2), round(point.diameter.high_cm, 2)
+        rows.append(cells)
+    return rows
+
+
+def _intervals(result: DbhEstimate) -> dict[str, float | None]:
+    """The cells of all three definitions, and the interval of the chosen one."""
+    cells: dict[str, float | None] = {}
+    for name, diameter in result.diameters.items():
+        ends = {"": diameter.value_cm, "_lo": diameter.low_cm, "_hi": diameter.high_cm}
+        rounded = {end: None if value is None else round(value, 2) for end, value in ends.items()}
+        cells.update({f"dbh_{name}{end}_cm": value for end, value in rounded.items()})
+        if name == result.definition:
+            cells.update({f"dbh{end}_cm": rounded[end] for end in ("_lo", "_hi")})
+    return cells
 
 
 def _points_of(path: Path, options: argparse.Namespace) -> Float64:

@@ -36,12 +36,14 @@ class StemAxis:
         direction: (3,) unit vector, upwards.
         ring: The stem around it there, across the axis; centre is `point_m`'s x, y. None where nothing round was found.
         source: ``stem`` where it was fitted, ``vertical`` where it was assumed.
+        taper: Metres of radius lost per metre of stem; None where it is not known.
     """
 
     point_m: Float64
     direction: Float64
     ring: Circle | None
     source: str
+    taper: float | None = None
 
     @property
     def lean_deg(self) -> float:
@@ -194,6 +196,7 @@ def _trusted(
         direction / np.linalg.norm(direction),
         Circle(state[:2], float(state[4]), sigma),
         "stem",
+        float(state[5]),
     )
 
 

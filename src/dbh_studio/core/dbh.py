@@ -3,125 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Bool, Float64, as_points, readonly
+from dbh_studio.core.arrays import Float64, as_points, readonly
 from dbh_studio.core.axis import WINDOW, StemAxis, band_m, stem_axis
-from dbh_studio.core.curves import CURVE_WORDS, CURVES
-from dbh_studio.core.curves.base import contains, distance_to_outline, outline_centroid, outline_metrics
-from dbh_studio.core.quality import Quality, disagreement_of, grade, plain_flags
-from dbh_studio.core.robust import canonical_order, ransac
+from dbh_studio.core.curves import CURVES
+from dbh_studio.core.curves.base import outline_centroid
+from dbh_studio.core.interval_methods import INTERVAL_METHODS, compared_fit, measured_with_interval
+from dbh_studio.core.measured import CurveFit, DbhEstimate, Diameter, Refusal
+from dbh_studio.core.quality import disagreement_of, grade, plain_flags
+from dbh_studio.core.robust import canonical_order
 from dbh_studio.core.section import CrossSection, cross_section
 from dbh_studio.settings import MeasureSettings
 
+__all__ = ["CurveFit", "DbhEstimate", "Diameter", "Refusal", "axis_of_stem", "measure_stem"]
+
 _DEFAULTS = MeasureSettings()
-_WORST_RATIO = 1.6
 _MOST_AXIS_POINTS = 200_000
-
-
-@dataclass(frozen=True, eq=False)
-class CurveFit:
-    """One closed curve fitted to a cross-section.
-
-    Attributes:
-        curve: Which model: ``fourier``, ``ellipse``, ``bspline``.
-        outline_uv_m: (M, 2) closed outline in section coordinates (last point joins the first).
-        perimeter_m: Length of the curve.
-        area_m2: Area inside it.
-        hull_girth_m: Perimeter of its convex hull, which is what a tape measures.
-        inliers: (N,) which section points support it.
-        rmse_m: Root mean square distance of the inliers to the curve.
-    """
-
-    curve: str
-    outline_uv_m: Float64
-    perimeter_m: float
-    area_m2: float
-    hull_girth_m: float
-    inliers: Bool
-    rmse_m: float
-
-    def diameter_m(self, definition: str) -> float:
-        """The diameter by definition ``curve`` (perimeter/π), ``tape`` (convex girth/π) or ``area`` (2√(A/π)).
-
-        Raises:
-            ValueError: No such definition.
-        """
-        if definition == "curve":
-            return self.perimeter_m / np.pi
-        if definition == "tape":
-            return self.hull_girth_m / np.pi
-        if definition == "area":
-            return 2.0 * float(np.sqrt(self.area_m2 / np.pi))
-        raise ValueError(f"definition {definition!r} is none of curve, tape, area")
-
-
-@dataclass(frozen=True, eq=False)
-class Refusal:
-    """Why a stem has no diameter, and what would give it one. Falsy, so that ``if estimate:`` reads well.
-
-    Attributes:
-        code: Short name for tables and tests: ``no_points``, ``no_band``, ``too_few_points``, ``no_ring``,
-            ``small_arc``, ``no_curve``, ``implausible``; ``unscaled`` from the stages.
-        reason: One sentence for the forester.
-        remedy: What to do.
-        section: The cross-section, where there is one to look at.
-        fits: Curves fitted nonetheless, for the picture only.
-    """
-
-    code: str
-    reason: str
-    remedy: str
-    section: CrossSection | None = None
-    fits: Mapping[str, CurveFit | Refusal] = field(default_factory=dict)
-
-    def __bool__(self) -> bool:
-        return False
-
-
-@dataclass(frozen=True, eq=False)
-class DbhEstimate:
-    """A diameter at breast height with what is needed to judge it.
-
-    Attributes:
-        dbh_cm: By `curve` and `definition`.
-        curve: The curve it is read from.
-        definition: ``curve``, ``tape`` or ``area``.
-        section: The cross-section measured.
-        fits: Every curve's fit (or refusal) on this section, by name.
-        quality: ``good``, ``fair`` or ``poor``, from arc, residual and agreement of the curves.
-        flags: What to look at, in plain words; empty where nothing stands out.
-        position_m: (3,) centre of the ring in the stem's frame.
-    """
-
-    dbh_cm: float
-    curve: str
-    definition: str
-    section: CrossSection
-    fits: Mapping[str, CurveFit | Refusal]
-    quality: Quality
-    flags: tuple[str, ...]
-    position_m: Float64
-
-    @property
-    def rmse_mm(self) -> float:
-        """Root mean square distance of the chosen curve's inliers, millimetres."""
-        return 1000.0 * self._chosen.rmse_m
-
-    @property
-    def n_points(self) -> int:
-        """How many points of the section support the chosen curve."""
-        return int(self._chosen.inliers.sum())
-
-    @property
-    def _chosen(self) -> CurveFit:
-        fit = self.fits[self.curve]
-        assert isinstance(fit, CurveFit)
-        return fit
 
 
 def measure_stem(
@@ -132,8 +34,12 @@ def measure_stem(
     curves: Sequence[str] | None = None,
     ground_note: str = "",
     axis: StemAxis | None = None,
+    scale_sd: float = 0.0,
 ) -> DbhEstimate | Refusal:
-    """The diameter of one stem at breast height (the paper's section III-E).
+    """The diameter of one stem at breast height, by the settings' method.
+
+    ``shrinkage`` and ``circle`` are `core.estimator`'s and come with an interval; ``fourier``, ``ellipse`` and
+    ``bspline`` are the paper's (section III-E).
 
     The result depends on the points, the settings and the seed; not on the order of the points.
 
@@ -142,9 +48,12 @@ def measure_stem(
             finite are left out.
         settings: Curve, band, definition, RANSAC.
         seed: Of the random samples; None takes the settings'.
-        curves: Which curves to fit beside the chosen one; None fits all.
+        curves: Which curves to fit beside the chosen one; None fits the paper's three where one of them is chosen,
+            and none where the method is another.
         ground_note: Added to the flags, for what the caller knows of the ground.
-        axis: Of the stem, where it is known already (see `axis_of_stem`); else it is found.
+        axis: Of the stem, where it is known already (see `axis_of_stem`; of the interval methods only where the search
+            starts, see `line_of_stem`); else it is found.
+        scale_sd: Relative standard error of the cloud's scale; widens the interval.
 
     Raises:
         ValueError: The array has a wrong shape, or a curve has no such name.
@@ -152,6 +61,16 @@ def measure_stem(
     points = as_points(points_m, name="points_m")
     names = _curve_names(settings.curve, curves)
     seed = settings.seed if seed is None else seed
+    if settings.curve in INTERVAL_METHODS:
+        return measured_with_interval(
+            points,
+            settings=settings,
+            seed=seed,
+            curves=names,
+            ground_note=ground_note,
+            scale_sd=scale_sd,
+            line=axis,
+        )
     low, high = band_m(settings)
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
@@ -170,8 +89,9 @@ def measure_stem(
             f"The {len(indices)} points between {low:.2f} and {high:.2f} m above ground do not form a ring.",
             "Look at the stem: remove what is not bark, or delete it if it is no tree.",
         )
-    fits = {name: _fit_curve(name, section, settings, seed) for name in names}
-    return _judged(section, fits, settings, ground_note)
+    finite_points = points[finite]
+    fits = {name: compared_fit(name, finite_points, section, settings, seed) for name in names}
+    return _judged(section, fits, settings, ground_note, axis)
 
 
 def axis_of_stem(
@@ -200,10 +120,11 @@ def axis_of_stem(
 
 def _curve_names(chosen: str, curves: Sequence[str] | None) -> list[str]:
     """The chosen curve first, then the others wanted."""
-    wanted = list(CURVES) if curves is None else list(curves)
-    unknown = [name for name in (chosen, *wanted) if name not in CURVES]
+    wanted = list(curves) if curves is not None else [] if chosen in INTERVAL_METHODS else list(CURVES)
+    known = (*INTERVAL_METHODS, *CURVES)
+    unknown = [name for name in (chosen, *wanted) if name not in known]
     if unknown:
-        raise ValueError(f"curve {unknown[0]!r} is none of {', '.join(CURVES)}")
+        raise ValueError(f"curve {unknown[0]!r} is none of {', '.join(known)}")
     return list(dict.fromkeys([chosen, *wanted]))
 
 
@@ -230,61 +151,12 @@ def _thin_band(heights_m: NDArray[np.floating[Any]], n_found: int, settings: Mea
     )
 
 
-def _fit_curve(name: str, section: CrossSection, settings: MeasureSettings, seed: int) -> CurveFit | Refusal:
-    """One curve by the paper's RANSAC, on the points near the ring."""
-    curve = CURVES[name].configured(settings)
-    radius = section.ring_radius_m
-    uv = section.uv_m[section.near_ring]
-    origin = uv.mean(axis=0) if settings.polar_origin == "centroid" and len(uv) else np.zeros(2)
-    tolerance = settings.ransac_tolerance_m
-    if settings.tolerance_share:
-        tolerance = min(tolerance, settings.tolerance_share * radius)
-    found = ransac(
-        (uv - origin) / radius,
-        curve,
-        n_samples=settings.ransac_samples,
-        tolerance=tolerance / radius,
-        n_iterations=settings.ransac_iterations,
-        rng=np.random.default_rng([seed, *name.encode()]),
-    )
-    if found is None:
-        return Refusal("no_curve", f"No closed {CURVE_WORDS[name]} curve follows the points.", _LOOK, section)
-    outline = curve.outline(found.params) * radius + origin
-    inliers = np.zeros(len(section.uv_m), bool)
-    inliers[section.near_ring] = found.inliers
-    perimeter, area, girth = outline_metrics(outline)
-    distance = distance_to_outline(section.uv_m[inliers], outline)
-    rmse = float(np.sqrt((distance**2).mean()))
-    fit = CurveFit(name, readonly(outline), perimeter, area, girth, readonly(inliers), rmse)
-    problem = _implausible(fit, section, settings)  # falsy, as every refusal
-    return fit if problem is None else problem
-
-
-_LOOK = "Look at the cross-section: remove what is not bark, or record the stem from more sides."
-
-
-def _implausible(fit: CurveFit, section: CrossSection, settings: MeasureSettings) -> Refusal | None:
-    """A refusal where a curve cannot be the stem's outline: it misses the ring, or contradicts it."""
-    diameter_cm = 100.0 * fit.diameter_m(settings.definition)
-    ring_cm = 200.0 * section.ring_radius_m
-    word = CURVE_WORDS[fit.curve]
-    if not contains(fit.outline_uv_m, np.zeros(2)):
-        return Refusal("implausible", f"The {word} curve does not go round the ring's centre.", _LOOK, section)
-    if not 1.0 / _WORST_RATIO < diameter_cm / ring_cm < _WORST_RATIO:
-        reason = f"The {word} curve gives {diameter_cm:.1f} cm where a circle gives {ring_cm:.1f} cm."
-        return Refusal("implausible", reason, _LOOK, section)
-    # Last: only where curve and ring agree does an odd size speak of the scale.
-    if not settings.min_diameter_cm <= diameter_cm <= settings.max_diameter_cm:
-        limits = f"{settings.min_diameter_cm:g} to {settings.max_diameter_cm:g} cm"
-        reason = f"The {word} curve gives {diameter_cm:.1f} cm, outside {limits}."
-        return Refusal(
-            "implausible", reason, "Check the scale of the cloud; if it is right, change the limits.", section
-        )
-    return None
-
-
 def _judged(
-    section: CrossSection, fits: Mapping[str, CurveFit | Refusal], settings: MeasureSettings, ground_note: str
+    section: CrossSection,
+    fits: Mapping[str, CurveFit | Refusal],
+    settings: MeasureSettings,
+    ground_note: str,
+    axis: StemAxis,
 ) -> DbhEstimate | Refusal:
     """The chosen curve's diameter with its quality, unless something speaks against giving one."""
     if section.coverage_deg < settings.min_coverage_deg:
@@ -298,12 +170,22 @@ def _judged(
     chosen = fits[settings.curve]
     if isinstance(chosen, Refusal):
         return replace(chosen, section=section, fits=fits)
-    diameters = {name: fit.diameter_m(settings.definition) for name, fit in fits.items() if isinstance(fit, CurveFit)}
+    # Of the paper's curves alone: what else is drawn beside them must not change the grade.
+    fitted = {name: fit for name, fit in fits.items() if isinstance(fit, CurveFit) and name in CURVES}
+    diameters = {name: fit.diameter_m(settings.definition) for name, fit in fitted.items()}
     diameters["circle"] = 2.0 * section.ring_radius_m
     disagreement = disagreement_of(
         diameters[settings.curve], [value for name, value in diameters.items() if name != settings.curve]
     )
     rmse_m, n_points = chosen.rmse_m, int(chosen.inliers.sum())
+    flags = plain_flags(
+        section,
+        rmse_m=rmse_m,
+        n_points=n_points,
+        disagreement=disagreement,
+        diameters_m=diameters,
+        ground_note=ground_note,
+    )
     return DbhEstimate(
         dbh_cm=100.0 * diameters[settings.curve],
         curve=settings.curve,
@@ -311,15 +193,10 @@ def _judged(
         section=section,
         fits=fits,
         quality=grade(section, rmse_m=rmse_m, disagreement=disagreement, n_points=n_points),
-        flags=plain_flags(
-            section,
-            rmse_m=rmse_m,
-            n_points=n_points,
-            disagreement=disagreement,
-            diameters_m=diameters,
-            ground_note=ground_note,
-        ),
+        flags=tuple(flag.words for flag in flags),
         position_m=readonly(section.stem_from_section.apply(_centre(chosen)[None])[0]),
+        flag_codes=tuple(flag.code for flag in flags),
+        taper_cm_per_m=None if axis.taper is None else 200.0 * axis.taper,
     )
 
 

@@ -25,7 +25,7 @@ TREE_STATUSES: tuple[TreeStatus, ...] = ("live", "dead", "")
 
 @dataclass(frozen=True)
 class TreeRecord:
-    """What a person says about a stem; nothing here is computed.
+    """What a person says about a stem; nothing here is computed from the stem's points.
 
     Attributes:
         species: Name or code as the person writes it.
@@ -34,6 +34,7 @@ class TreeRecord:
         tag: The number on the tree's tag.
         edited: Whether a person changed the stem's points.
         tree_id: The tree this stem belongs to; None where the stem is a tree of its own.
+        flag: What the search that found the stem wants looked at; a person may clear it.
     """
 
     species: str = ""
@@ -42,9 +43,10 @@ class TreeRecord:
     tag: str = ""
     edited: bool = False
     tree_id: int | None = None
+    flag: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("species", "note", "tag"):
+        for name in ("species", "note", "tag", "flag"):
             check_text(name, getattr(self, name))
         if self.status not in TREE_STATUSES:
             raise ValueError(f"status is {self.status!r} but must be one of {TREE_STATUSES}")
@@ -54,6 +56,11 @@ class TreeRecord:
             is_whole = isinstance(self.tree_id, int) and not isinstance(self.tree_id, bool)
             if not (is_whole and 0 < self.tree_id <= MAX_TRUNK_ID):
                 raise ValueError(f"tree id is {self.tree_id!r} but must be a number from 1 to {MAX_TRUNK_ID}")
+
+    @property
+    def remark(self) -> str:
+        """The note, and what is to be looked at."""
+        return "; ".join(filter(None, (self.note, self.flag)))
 
 
 def check_text(name: str, text: object) -> None:
@@ -81,6 +88,12 @@ class InventoryRow:
 
     Attributes:
         tree_id: The tree the stem belongs to; `stem_id` is unique in the plot.
+        dbh_cm: By `dbh_method` and `dbh_definition`; `dbh_lo_cm` and `dbh_hi_cm` are its 90 % interval, None where the
+            method has none (the paper's curves).
+        dbh_tape_cm: Convex girth/π, with its interval; `dbh_curve_cm` is perimeter/π, `dbh_area_cm` 2√(A/π). `dbh_cm`
+            is one of the three.
+        taper_cm_per_m: Loss of diameter per metre of stem.
+        flags: Short names of what to look at, see `core.measured.Flag`; `reason` says it in words.
         hom_m: Height of measurement above ground.
         n_points: Points of the section that support the curve; all of the section where there is no diameter.
         lean_deg: None where the axis was assumed vertical for want of stem.
@@ -98,15 +111,28 @@ class InventoryRow:
     status: str
     species: str
     dbh_cm: float | None
+    dbh_lo_cm: float | None
+    dbh_hi_cm: float | None
     dbh_method: str
     dbh_definition: str
+    dbh_tape_cm: float | None
+    dbh_tape_lo_cm: float | None
+    dbh_tape_hi_cm: float | None
+    dbh_curve_cm: float | None
+    dbh_curve_lo_cm: float | None
+    dbh_curve_hi_cm: float | None
+    dbh_area_cm: float | None
+    dbh_area_lo_cm: float | None
+    dbh_area_hi_cm: float | None
     hom_m: float | None
     coverage_deg: float | None
     max_gap_deg: float | None
     rmse_mm: float | None
     n_points: int | None
     lean_deg: float | None
+    taper_cm_per_m: float | None
     quality: str
+    flags: str
     reason: str
     remedy: str
     edited: bool
@@ -122,6 +148,7 @@ class InventoryRow:
 
 
 COLUMNS: tuple[str, ...] = tuple(column.name for column in fields(InventoryRow))
+_DIAMETER_COLUMNS = tuple(name for name in COLUMNS if name.startswith("dbh_") and name.endswith("_cm"))
 
 
 @dataclass(frozen=True)
@@ -194,7 +221,7 @@ def inventory_row(
     """
     section, fit = result.section, _chosen_fit(result)
     # An assumed axis tells nothing about the lean.
-    lean_deg = section.lean_deg if section is not None and section.axis_source != "vertical" else None
+    lean_deg = section.lean_deg if section is not None and section.axis_source == "stem" else None
     error_pct = 100.0 * scale.standard_error / scale.metres_per_unit if scale.standard_error is not None else None
     return InventoryRow(
         plot_id=plot_id,
@@ -203,7 +230,7 @@ def inventory_row(
         tag=record.tag,
         status=record.status,
         species=record.species,
-        **_result_cells(result),
+        **_result_cells(result, record.flag),
         hom_m=_known(section.hom_m) if section else None,
         coverage_deg=_known(section.coverage_deg) if section else None,
         max_gap_deg=_known(section.max_gap_deg) if section else None,
@@ -223,24 +250,34 @@ def inventory_row(
     )
 
 
-def _result_cells(result: DbhEstimate | Refusal) -> dict[str, Any]:
-    """The columns that an estimate and a refusal fill differently."""
+def _result_cells(result: DbhEstimate | Refusal, flag: str = "") -> dict[str, Any]:
+    """The columns that an estimate and a refusal fill differently; `flag` is one more thing to look at."""
     from dbh_studio.core.dbh import DbhEstimate
 
     if isinstance(result, DbhEstimate):
+        low, high = result.interval or (None, None)
+        cells: dict[str, Any] = {"dbh_cm": _known(result.dbh_cm), "dbh_lo_cm": _known(low), "dbh_hi_cm": _known(high)}
+        for name, diameter in result.diameters.items():
+            cells[f"dbh_{name}_cm"] = _known(diameter.value_cm)
+            cells[f"dbh_{name}_lo_cm"] = _known(diameter.low_cm)
+            cells[f"dbh_{name}_hi_cm"] = _known(diameter.high_cm)
         return {
-            "dbh_cm": _known(result.dbh_cm),
+            **cells,
             "dbh_method": result.curve,
             "dbh_definition": result.definition,
+            "taper_cm_per_m": _known(result.taper_cm_per_m),
             "quality": result.quality,
-            "reason": "; ".join(result.flags),
+            "flags": ";".join(result.flag_codes),
+            "reason": "; ".join(filter(None, (*result.flags, flag))),
             "remedy": "",
         }
     return {
-        "dbh_cm": None,
+        **dict.fromkeys(_DIAMETER_COLUMNS),
         "dbh_method": "",
         "dbh_definition": "",
+        "taper_cm_per_m": None,
         "quality": "refused",
-        "reason": result.reason,
+        "flags": result.code,
+        "reason": "; ".join(filter(None, (result.reason, flag))),
         "remedy": result.remedy,
     }

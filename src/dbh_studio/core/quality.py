@@ -9,12 +9,15 @@ from typing import Literal
 import numpy as np
 
 from dbh_studio.core.curves import CURVE_WORDS
+from dbh_studio.core.measured import Flag
 from dbh_studio.core.section import CrossSection
 
 Quality = Literal["good", "fair", "poor"]
 
 _GRADES: tuple[Quality, ...] = ("good", "fair", "poor")
 _LEAN_TO_MENTION_DEG = 10.0
+
+GOOD_HALF_WIDTH, FAIR_HALF_WIDTH = 0.06, 0.15
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,11 @@ def grade(section: CrossSection, *, rmse_m: float, disagreement: float, n_points
     return _GRADES[worst]
 
 
+def grade_of_interval(half_width: float) -> Quality:
+    """By half of the 90 % interval, relative: ``good`` below 6 %, ``fair`` below 15 %."""
+    return "good" if half_width < GOOD_HALF_WIDTH else "fair" if half_width < FAIR_HALF_WIDTH else "poor"
+
+
 def disagreement_of(chosen_m: float, others_m: Sequence[float]) -> float:
     """|chosen - median of the others| relative to the latter: one curve that has gone astray does not speak for all."""
     middle = float(np.median(others_m))
@@ -75,27 +83,27 @@ def plain_flags(
     disagreement: float,
     diameters_m: Mapping[str, float],
     ground_note: str,
-) -> tuple[str, ...]:
+) -> tuple[Flag, ...]:
     """What stands out, in words for the forester; empty where nothing does."""
     flags = []
     if section.coverage_deg < GOOD.coverage_deg:
-        flags.append(f"only {section.coverage_deg:.0f}° of the ring seen")
+        flags.append(Flag("partial_arc", f"only {section.coverage_deg:.0f}° of the ring seen"))
     elif section.max_gap_deg > GOOD.gap_deg:
-        flags.append(f"a gap of {section.max_gap_deg:.0f}° in the ring")
+        flags.append(Flag("gap", f"a gap of {section.max_gap_deg:.0f}° in the ring"))
     if disagreement > GOOD.disagreement:
         said = ", ".join(f"{CURVE_WORDS.get(name, name)} {100 * value:.1f} cm" for name, value in diameters_m.items())
-        flags.append(f"curves disagree by {100 * disagreement:.0f} %: {said}")
+        flags.append(Flag("disagree", f"curves disagree by {100 * disagreement:.0f} %: {said}"))
     if n_points < GOOD.n_points:
-        flags.append(f"few points: {n_points}")
+        flags.append(Flag("few_points", f"few points: {n_points}"))
     if rmse_m / section.ring_radius_m > GOOD.spread:
-        flags.append(f"thick ring: points lie {1000 * rmse_m:.0f} mm from the curve on average")
+        flags.append(Flag("thick_ring", f"thick ring: points lie {1000 * rmse_m:.0f} mm from the curve on average"))
     off_curve = 1.0 - n_points / len(section.uv_m)
     if off_curve > 1.0 - GOOD.support:
-        flags.append(f"{100 * off_curve:.0f} % of the band's points are not on the curve")
+        flags.append(Flag("off_curve", f"{100 * off_curve:.0f} % of the band's points are not on the curve"))
     if section.lean_deg > _LEAN_TO_MENTION_DEG:
-        flags.append(f"stem leans {section.lean_deg:.0f}°")
+        flags.append(Flag("lean", f"stem leans {section.lean_deg:.0f}°"))
     if section.axis_source == "vertical":
-        flags.append("too little of the stem seen to find its lean: taken as upright")
+        flags.append(Flag("upright", "too little of the stem seen to find its lean: taken as upright"))
     if ground_note:
-        flags.append(ground_note)
+        flags.append(Flag("ground", ground_note))
     return tuple(flags)

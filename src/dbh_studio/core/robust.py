@@ -165,7 +165,7 @@ def robust_circle(
     fitted = thinned(uv_m, int(2000 * effort), rng)
     scored = thinned(fitted, int(500 * effort), rng)
     triples = scored[rng.integers(0, len(scored), (int(200 * effort), 3))]
-    centres, radii = _circumcircles(triples)
+    centres, radii = circumcircles(triples)
     possible = np.isfinite(radii) & (radii < max_radius_m) & (radii > 0.1 * tolerance_m)
     if hint is not None:
         centres, radii = np.vstack([centres, hint.centre_m]), np.append(radii, hint.radius_m)
@@ -184,13 +184,13 @@ def robust_circle(
     return _refined(fitted, centres[best], float(radii[best]), tolerance_m, max_radius_m)
 
 
-def _circumcircles(triples: Float64) -> tuple[Float64, Float64]:
+def circumcircles(triples: Float64) -> tuple[Float64, Float64]:
     """(H, 2) centres and (H,) radii through (H, 3, 2) points; not finite where these are on a line."""
     a = triples[:, 0]
     b, c = triples[:, 1] - a, triples[:, 2] - a
     doubled = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     b2, c2 = (b**2).sum(axis=1), (c**2).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         x = (c[:, 1] * b2 - b[:, 1] * c2) / doubled
         y = (b[:, 0] * c2 - c[:, 0] * b2) / doubled
     return a + np.stack([x, y], axis=1), np.hypot(x, y)

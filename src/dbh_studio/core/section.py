@@ -28,7 +28,8 @@ class CrossSection:
         band_m: Lower and upper height above ground.
         hom_m: Height of measurement: the band's centre above ground.
         lean_deg: Angle between the stem's axis and the vertical.
-        axis_source: How the axis was found: ``stem`` (fitted over a long enough stretch) or ``vertical`` (assumed).
+        axis_source: How the axis was found: ``stem`` (fitted over a long enough stretch), ``vertical`` (assumed), or
+            ``prior`` (found together with the outline, but from so little of the stem that it is a guess).
         coverage_deg: How much of the ring was seen.
         max_gap_deg: The largest unseen sector.
         ring_radius_m: Radius of a robust circle: a first idea, not the measurement.

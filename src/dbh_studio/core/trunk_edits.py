@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from dbh_studio.core.arrays import Bool, Float, Float64, Int32, Int64, as_points
-from dbh_studio.core.neighbours import N_WORKERS
 from dbh_studio.core.picking import View
 from dbh_studio.core.trunks import Trunk
 
@@ -77,6 +75,10 @@ def grown(points: Float, members: NDArray[Any], free: NDArray[Any], distance: fl
     rows = free[_in_box(points[free], own.min(axis=0) - distance, own.max(axis=0) + distance)]
     if not len(rows):
         return np.empty(0, np.int64)
+    from scipy.spatial import cKDTree  # slow to import, and who owns which points is asked without it
+
+    from dbh_studio.core.neighbours import N_WORKERS
+
     tree = cKDTree(own, balanced_tree=False, compact_nodes=False)
     gap = tree.query(points[rows], distance_upper_bound=distance, workers=N_WORKERS)[0]
     return np.asarray(rows[np.isfinite(gap)])
@@ -96,6 +98,10 @@ def shrunk(points: Float, members: NDArray[Any], others: NDArray[Any], distance:
     members, others = np.asarray(members, np.int64), np.asarray(others, np.int64)
     if not len(members) or not distance > 0:
         return members
+    from scipy.spatial import cKDTree
+
+    from dbh_studio.core.neighbours import N_WORKERS
+
     own = points[members]
     near = others[_in_box(points[others], own.min(axis=0) - distance, own.max(axis=0) + distance)]
     stays = np.ones(len(members), bool)

@@ -19,7 +19,8 @@ from dbh_studio.io.atomic import atomic_file
 
 # Decimals by column: a tape reads millimetres, a scanner no finer than that.
 _DECIMALS = {
-    "dbh_cm": 2,
+    **{column: 2 for column in COLUMNS if column.startswith("dbh_") and column.endswith("_cm")},
+    "taper_cm_per_m": 2,
     "hom_m": 3,
     "coverage_deg": 1,
     "max_gap_deg": 1,
@@ -32,6 +33,14 @@ _DECIMALS = {
     "easting": 3,
     "northing": 3,
 }
+
+# Of inventories written before diameters had intervals: still ours to replace.
+_EARLIER_COLUMNS = tuple(
+    column
+    for column in COLUMNS
+    if column not in ("taper_cm_per_m", "flags")
+    and (column == "dbh_cm" or not (column.startswith("dbh_") and column.endswith("_cm")))
+)
 
 # OWASP, "CSV injection": these start a formula in Excel, LibreOffice and Google Sheets, at the start of a cell. Where
 # the decimal sign is a comma, a spreadsheet divides at semicolons and takes the quotes around our cell for letters:
@@ -142,7 +151,7 @@ def _is_inventory(path: Path) -> bool:
             header, *rows = csv.reader(file, strict=True)
     except (OSError, ValueError, csv.Error):
         return False
-    return tuple(header) == COLUMNS and all(len(row) == len(COLUMNS) for row in rows)
+    return tuple(header) in (COLUMNS, _EARLIER_COLUMNS) and all(len(row) == len(header) for row in rows)
 
 
 def projected_epsg(crs: str | None) -> tuple[bool, int | None]:

@@ -13,7 +13,9 @@ from dbh_studio.core.arrays import Float64, as_points, readonly
 from dbh_studio.core.axis import StemAxis, band_m
 from dbh_studio.core.dbh import DbhEstimate, Refusal, axis_of_stem, measure_stem
 from dbh_studio.core.ground import GroundKind, GroundModel
+from dbh_studio.core.interval_methods import INTERVAL_METHODS, line_of_stem
 from dbh_studio.core.progress import Progress, ignore_progress
+from dbh_studio.core.stem_profile import ProfilePoint, stem_profile
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.settings import MeasureSettings
 
@@ -54,6 +56,7 @@ def measure_trunk(
     ground: GroundModel,
     settings: MeasureSettings = _DEFAULTS,
     curves: Sequence[str] | None = None,
+    scale_sd: float = 0.0,
 ) -> StemMeasurement:
     """Measure one stem.
 
@@ -65,7 +68,8 @@ def measure_trunk(
         trunk_id: Kept in the result.
         ground: Under the plot.
         settings: Of the measurement.
-        curves: Which curves to fit beside the chosen one; None fits all.
+        curves: Which curves to fit beside the chosen one, as for `core.dbh.measure_stem`.
+        scale_sd: Relative standard error of the scale; widens the interval.
     """
     points = as_points(points_world, name="points_world")
     finite = points[np.isfinite(points).all(axis=1)]
@@ -73,9 +77,30 @@ def measure_trunk(
         refusal = measure_stem(points, settings=settings)
         return StemMeasurement(trunk_id, refusal, readonly(np.full(2, np.nan)), np.nan, len(points), ground.kind)
     z_ground, axis, note = _ground_at_stem(finite, ground, settings)
-    result = measure_stem(_above(points, z_ground), settings=settings, curves=curves, ground_note=note, axis=axis)
+    result = measure_stem(
+        _above(points, z_ground), settings=settings, curves=curves, ground_note=note, axis=axis, scale_sd=scale_sd
+    )
     centre = result.position_m if isinstance(result, DbhEstimate) else axis.point_m
     return StemMeasurement(trunk_id, result, readonly(centre[:2].copy()), z_ground, len(points), ground.kind)
+
+
+def profile_trunk(
+    points_world: NDArray[np.floating[Any]],
+    *,
+    z_ground_m: float,
+    settings: MeasureSettings = _DEFAULTS,
+    scale_sd: float = 0.0,
+) -> tuple[ProfilePoint, ...]:
+    """Diameters every 10 cm along one stem, see `core.stem_profile`.
+
+    Args:
+        points_world: (N, 3) the trunk's points, metres, +z up.
+        z_ground_m: Height of the ground at the stem, from its measurement.
+        settings: Of the measurement.
+        scale_sd: Relative standard error of the scale.
+    """
+    points = as_points(points_world, name="points_world")
+    return stem_profile(_above(points, z_ground_m), settings=settings, scale_sd=scale_sd)
 
 
 def measure_all(
@@ -85,6 +110,7 @@ def measure_all(
     ground: GroundModel,
     settings: MeasureSettings = _DEFAULTS,
     curves: Sequence[str] | None = None,
+    scale_sd: float = 0.0,
     progress: Progress = ignore_progress,
 ) -> dict[int, StemMeasurement]:
     """Measure every trunk of a set, by id.
@@ -95,6 +121,7 @@ def measure_all(
         ground: Under the plot.
         settings: Of the measurement.
         curves: As for `measure_trunk`.
+        scale_sd: As for `measure_trunk`.
         progress: Called before every stem.
 
     Raises:
@@ -104,7 +131,7 @@ def measure_all(
     for done, trunk in enumerate(trunks):
         progress(done / len(trunks), f"Measuring tree {trunk.id}")
         measured[trunk.id] = measure_trunk(
-            points_of(trunk), trunk_id=trunk.id, ground=ground, settings=settings, curves=curves
+            points_of(trunk), trunk_id=trunk.id, ground=ground, settings=settings, curves=curves, scale_sd=scale_sd
         )
     progress(1.0, f"Measured {len(measured)} trees")
     return measured
@@ -126,13 +153,19 @@ def _ground_at_stem(
     z_ground, note = first, ""
     if ground.kind == "stem_base":
         z_ground, note = _own_base(points, first)
-    axis = axis_of_stem(_above(points, z_ground), settings=settings)
+    axis = _axis(_above(points, z_ground), settings)
     if ground.kind == "stem_base":
         return z_ground, axis, note
     moved_to = _ground_at_foot(axis, z_ground, ground)
     if abs(moved_to - z_ground) > _MOVED_ENOUGH_M:
-        return moved_to, axis_of_stem(_above(points, moved_to), settings=settings), note
+        return moved_to, _axis(_above(points, moved_to), settings), note
     return moved_to, _lowered(axis, moved_to - z_ground, settings), note
+
+
+def _axis(points_above: NDArray[np.floating[Any]], settings: MeasureSettings) -> StemAxis:
+    """The stem's axis, found as the settings' method finds it."""
+    line = line_of_stem(points_above, settings=settings) if settings.curve in INTERVAL_METHODS else None
+    return axis_of_stem(points_above, settings=settings) if line is None else line
 
 
 def _ground_at_foot(axis: StemAxis, z_axis: float, ground: GroundModel) -> float:

@@ -82,6 +82,14 @@ def _hull_girth(outline: Float64, perimeter: float) -> float:
         return perimeter
 
 
+def hull_outline(outline: Float64) -> Float64:
+    """(K, 2) convex hull of an (M, 2) outline, where a tape would lie; the outline itself where it has none."""
+    try:
+        return np.asarray(outline[ConvexHull(outline).vertices], np.float64)
+    except QhullError:
+        return outline
+
+
 def _signed_area(outline: Float64) -> float:
     following = np.roll(outline, -1, axis=0)
     return 0.5 * float((outline[:, 0] * following[:, 1] - outline[:, 1] * following[:, 0]).sum())

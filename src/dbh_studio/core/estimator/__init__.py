@@ -1,6 +1,6 @@
 """The estimator of stem diameters with honest intervals: `estimate_diameter`."""
 
-from dbh_studio.core.estimator.estimate import estimate_diameter
-from dbh_studio.core.estimator.result import Diameter, EstimatorResult, Flag
+from dbh_studio.core.estimator.estimate import Assessment, assess_stem, estimate_diameter, stem_line
+from dbh_studio.core.estimator.result import EstimatorResult
 
-__all__ = ["Diameter", "EstimatorResult", "Flag", "estimate_diameter"]
+__all__ = ["Assessment", "EstimatorResult", "assess_stem", "estimate_diameter", "stem_line"]

@@ -9,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbh_studio.core.arrays import Float64, as_points, readonly
-from dbh_studio.core.dbh import Refusal
+from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.estimator.circle import circle_tube
-from dbh_studio.core.estimator.evidence import Evidence, evidence_of, flags_of, stem_beside
+from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, evidence_of, flags_of, oval_of, stem_beside
 from dbh_studio.core.estimator.fit import fit_tube
 from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
 from dbh_studio.core.estimator.posterior import N_OUTLINE, Patches, Posterior, patches_of, posterior_of
 from dbh_studio.core.estimator.prior import StemPrior
-from dbh_studio.core.estimator.result import Diameter, EstimatorResult, Flag
+from dbh_studio.core.estimator.result import EstimatorResult
 from dbh_studio.core.estimator.sample import sample_points
 from dbh_studio.core.estimator.search import find_rings
 from dbh_studio.core.estimator.tube import Tube, wave_basis
+from dbh_studio.core.measured import Diameter, Flag, Refusal
+from dbh_studio.core.robust import Circle
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
 
@@ -51,23 +53,113 @@ def estimate_diameter(
     Raises:
         ValueError: The array has a wrong shape, or `scale_sd` or `drift_m` is negative.
     """
+    found = assess_stem(points_m, settings=settings, scale_sd=scale_sd, drift_m=drift_m, seed=seed)
+    if found.refusal is not None:
+        return found.refusal
+    assert found.result is not None
+    return found.result
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """What was found of a stem, and why it is no diameter where it is none.
+
+    Attributes:
+        result: None where nothing round was found.
+        refusal: None where the result may be given.
+    """
+
+    result: EstimatorResult | None
+    refusal: Refusal | None
+
+
+def assess_stem(
+    points_m: NDArray[np.floating[Any]],
+    *,
+    settings: EstimatorSettings = _DEFAULTS,
+    scale_sd: float = 0.0,
+    drift_m: float = 0.0,
+    seed: int | None = None,
+    line: StemAxis | None = None,
+) -> Assessment:
+    """As `estimate_diameter`, but with what was found also where it is refused, to be looked at.
+
+    Args:
+        points_m: As there, and the other arguments.
+        settings: Of the estimator.
+        scale_sd: Of the scale.
+        drift_m: Of the passes.
+        seed: Of the samples.
+        line: Where the stem is, from `stem_line`, if it was looked for already.
+    """
     for name, value in (("scale_sd", scale_sd), ("drift_m", drift_m)):
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} is {value} but must be finite and not negative")
     points = as_points(points_m, name="points_m")
     seed = settings.seed if seed is None else seed
-    finite = np.isfinite(points).all(axis=1)
-    low, high = settings.breast_height_m - settings.below_m, settings.breast_height_m + settings.above_m
-    used = points[finite & (points[:, 2] >= low) & (points[:, 2] <= high)].astype(np.float64)
+    used, heights = _window(points, settings)
     if len(used) < settings.min_points:
-        return _too_few(points[finite, 2], len(used), low, high, settings)
+        return Assessment(None, _too_few(heights, len(used), settings))
+    local, origin = _local(used, settings, seed)
+    start = _start(local, settings, seed) if line is None or line.ring is None else _start_at(line, line.ring, origin)
+    found = _no_ring(local, settings) if start is None else _fitted(local, start, settings, seed)
+    if isinstance(found, Refusal):
+        return Assessment(None, found)
+    return _judged(found, origin, settings, _Told(scale_sd, drift_m))
+
+
+def stem_line(
+    points_m: NDArray[np.floating[Any]], *, settings: EstimatorSettings = _DEFAULTS, seed: int | None = None
+) -> StemAxis | None:
+    """Where the stem is, to start from: its axis and a first radius; None where nothing is round.
+
+    Args:
+        points_m: (N, 3) points as for `estimate_diameter`.
+        settings: Of the estimator.
+        seed: Of the random samples.
+    """
+    seed = settings.seed if seed is None else seed
+    used, _ = _window(as_points(points_m, name="points_m"), settings)
+    if len(used) < settings.min_points:
+        return None
+    local, origin = _local(used, settings, seed)
+    start = _start(local, settings, seed)
+    if start is None:
+        return None
+    centre = origin + np.array([*start.centre, 0.0])
+    return StemAxis(centre, start.frame()[2], Circle(centre[:2], start.radius, start.sigma), "stem")
+
+
+def _window(points: NDArray[np.floating[Any]], settings: EstimatorSettings) -> tuple[Float64, Float64]:
+    """(N, 3) finite points of the stretch of stem used, and the heights of all finite points."""
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = _stretch(settings)
+    return points[(points[:, 2] >= low) & (points[:, 2] <= high)].astype(np.float64), points[:, 2].astype(np.float64)
+
+
+def _stretch(settings: EstimatorSettings) -> tuple[float, float]:
+    return settings.breast_height_m - settings.below_m, settings.breast_height_m + settings.above_m
+
+
+def _local(used: Float64, settings: EstimatorSettings, seed: int) -> tuple[Float64, Float64]:
+    """(N, 3) sample of the points about an origin at breast height, and that origin."""
     # Rounded, so that a plot's survey coordinates cost no digits and the sample does not depend on the median's last.
     origin = np.array([*np.round(np.median(used[:, :2], axis=0), 2), settings.breast_height_m])
-    local = used[sample_points(used, settings.max_points, seed=seed)] - origin
-    found = _fitted(local, settings, seed)
-    if isinstance(found, Refusal):
-        return found
-    return _judged(found, origin, settings, _Told(scale_sd, drift_m))
+    return used[sample_points(used, settings.max_points, seed=seed)] - origin, origin
+
+
+def _start(local: Float64, settings: EstimatorSettings, seed: int) -> Tube | None:
+    """The likeliest ring; None where there is none."""
+    rng = np.random.default_rng([seed, 201])
+    rings, _ = find_rings(local, widest_m=settings.max_diameter_cm / 200.0, taper=settings.taper, rng=rng)
+    if not len(rings.radius):
+        return None
+    return Tube(rings.middles()[0], rings.slope[0], float(rings.radius[0]), 0.0, np.empty(0), float(rings.sigma[0]))
+
+
+def _start_at(line: StemAxis, ring: Circle, origin: Float64) -> Tube:
+    slope = line.direction[:2] / line.direction[2]
+    return Tube(line.xy_at(float(origin[2])) - origin[:2], slope, ring.radius_m, 0.0, np.empty(0), ring.sigma_m)
 
 
 @dataclass(frozen=True)
@@ -90,32 +182,40 @@ class _Found:
     method: str
 
 
-def _fitted(local: Float64, settings: EstimatorSettings, seed: int) -> _Found | Refusal:
-    """Search, fit and posterior; the plain circle where the ring's fit fails."""
+def _fitted(local: Float64, start: Tube, settings: EstimatorSettings, seed: int) -> _Found | Refusal:
+    """Fit and posterior; the plain circle where the ring's fit fails."""
     prior = StemPrior.from_settings(settings)
-    rng = np.random.default_rng([seed, 201])
-    rings, _ = find_rings(local, widest_m=settings.max_diameter_cm / 200.0, taper=settings.taper, rng=rng)
-    if not len(rings.radius):
-        return _no_ring(local, settings)
-    start = Tube(rings.middles()[0], rings.slope[0], float(rings.radius[0]), 0.0, np.empty(0), float(rings.sigma[0]))
-    for method in ("ring", "circle") if settings.method == "ring" else ("circle",):
-        tube = (
-            fit_tube(local, start, prior) if method == "ring" else circle_tube(local, start, prior, settings, seed=seed)
-        )
-        patches = None if tube is None else patches_of(local, tube, bloat_chance=settings.bloat_chance)
-        if tube is None or patches is None:
-            continue
-        belief = prior if method == "ring" else replace(prior, highest=1)
-        posterior = posterior_of(patches, tube, belief, seed=seed)
-        tube = posterior.tube if method == "ring" else replace(tube, radius=tube.radius + patches.shift_m)
-        evidence = evidence_of(local, tube)
-        if evidence is not None:
-            return _Found(local, tube, posterior, patches, evidence, method)
-    return _no_ring(local, settings)
+    if settings.method == "ring":
+        found = _by("ring", local, start, prior, settings, seed)
+        if found is not None and oval_of(found.tube) > ODD_SHAPE:
+            # A second stem may have been taken for a bulge of this one: a circle does not reach round both.
+            circle = _by("circle", local, start, prior, settings, seed)
+            widest_m = settings.max_diameter_cm / 200.0
+            if circle is not None and stem_beside(local, circle.tube, widest_m=widest_m, seed=settings.seed):
+                return circle
+        if found is not None:
+            return found
+    found = _by("circle", local, start, prior, settings, seed)
+    return _no_ring(local, settings) if found is None else found
 
 
-def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _Told) -> EstimatorResult | Refusal:
-    """The result, unless it says too little or is no tree."""
+def _by(
+    method: str, local: Float64, start: Tube, prior: StemPrior, settings: EstimatorSettings, seed: int
+) -> _Found | None:
+    """What one method finds; None where it finds nothing."""
+    is_ring = method == "ring"
+    tube = fit_tube(local, start, prior) if is_ring else circle_tube(local, start, prior, settings, seed=seed)
+    patches = None if tube is None else patches_of(local, tube, bloat_chance=settings.bloat_chance)
+    if tube is None or patches is None:
+        return None
+    posterior = posterior_of(patches, tube, prior if is_ring else replace(prior, highest=1), seed=seed)
+    tube = posterior.tube if is_ring else replace(tube, radius=tube.radius + patches.shift_m)
+    evidence = evidence_of(local, tube)
+    return None if evidence is None else _Found(local, tube, posterior, patches, evidence, method)
+
+
+def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _Told) -> Assessment:
+    """The result, with a refusal where it says too little or is no tree."""
     logs = dict(found.posterior.quantiles)
     if found.method == "circle":  # its own radius, with the width of a round tube's posterior
         logs = {name: _moved_to(values, np.log(2.0 * found.tube.radius)) for name, values in logs.items()}
@@ -123,16 +223,26 @@ def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _
     calibration = CALIBRATIONS[found.method]
     spreads = {name: _spread(values, found) for name, values in logs.items()}
     diameters = {name: _diameter(logs[name][1], calibration, spread, told) for name, spread in spreads.items()}
-    chosen = diameters[settings.definition]
+    spread = spreads[settings.definition]
+    log_sd = calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
+    result = _result(found, origin, settings, diameters, spread, log_sd)
+    return Assessment(result, _refusal(found, settings, diameters[settings.definition], spread, log_sd))
+
+
+def _refusal(
+    found: _Found, settings: EstimatorSettings, chosen: Diameter, spread: Spread, log_sd: float
+) -> Refusal | None:
+    """Why a result may not be given; None where it may."""
+    if spread.depth_noise > settings.max_depth_noise:
+        return _too_shallow(found, spread)
     if not settings.min_diameter_cm <= chosen.value_cm <= settings.max_diameter_cm:
         limits = f"{settings.min_diameter_cm:g} to {settings.max_diameter_cm:g} cm"
         reason = f"The ring is {chosen.value_cm:.1f} cm thick, outside {limits}."
         return Refusal("implausible", reason, "Check the scale of the cloud; if it is right, change the limits.")
-    spread = spreads[settings.definition]
-    log_sd = calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
-    if calibration.factor * log_sd > settings.max_half_width or found.evidence.arc_deg < settings.min_arc_deg:
+    is_wide = CALIBRATIONS[found.method].factor * log_sd > settings.max_half_width
+    if is_wide or found.evidence.arc_deg < settings.min_arc_deg:
         return _too_uncertain(found.evidence, chosen)
-    return _result(found, origin, settings, diameters, spread, log_sd)
+    return None
 
 
 def _result(
@@ -149,10 +259,16 @@ def _result(
     position = origin + np.array([*tube.centre, 0.0])
     angle = np.arange(N_OUTLINE) * (2 * np.pi / N_OUTLINE)
     radius = tube.radius + tube.waves @ wave_basis(np.cos(angle), np.sin(angle), 1 + len(tube.waves) // 2)
-    beside = stem_beside(found.points, tube, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed)
-    flags = flags_of(evidence, tube, lean_deg=lean, neighbour=beside)
+    flags = flags_of(
+        evidence,
+        tube,
+        lean_deg=lean,
+        beside=stem_beside(found.points, tube, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed),
+        drift_chance=CALIBRATIONS[found.method].drift_chance(spread),
+    )
     if found.method != settings.method:
-        flags = (*flags, Flag("fallback", "the closed curve found no hold; a plain circle was fitted"))
+        words = "the closed curve had no hold, or reached round two stems: a plain circle was fitted"
+        flags = (*flags, Flag("fallback", words))
     return EstimatorResult(
         diameters=diameters,
         definition=settings.definition,
@@ -176,14 +292,15 @@ def _result(
 
 
 def _spread(logs: tuple[float, float, float], found: _Found) -> Spread:
+    evidence = found.evidence
     return Spread(
         posterior=(logs[2] - logs[0]) / 3.29,
         sigma_m=found.tube.sigma,
-        scatter_m=found.patches.scatter_m,
-        gap=found.evidence.gap_deg / 360.0,
+        gap=evidence.gap_deg / 360.0,
         bloat_m=float(np.hypot(found.patches.shift_m, found.patches.shift_sd_m)),
-        walls_m=found.evidence.two_walls_m,
-        waves=float(np.sqrt(0.5 * (found.tube.waves**2).sum())) / found.tube.radius,
+        waves=oval_of(found.tube),
+        wall_ratio=evidence.wall_ratio,
+        wall_m=evidence.wall_m,
         diameter_m=float(np.exp(logs[1])),
     )
 
@@ -200,9 +317,8 @@ def _moved_to(logs: tuple[float, float, float], middle: float) -> tuple[float, f
     return logs[0] + shift, logs[1] + shift, logs[2] + shift
 
 
-def _too_few(
-    heights_m: NDArray[np.floating[Any]], n_used: int, low: float, high: float, settings: EstimatorSettings
-) -> Refusal:
+def _too_few(heights_m: Float64, n_used: int, settings: EstimatorSettings) -> Refusal:
+    low, high = _stretch(settings)
     if not len(heights_m):
         return Refusal("no_points", "The stem has no points.", "Segment the plot again, or add points by hand.")
     if n_used:
@@ -231,3 +347,13 @@ def _too_uncertain(evidence: Evidence, chosen: Diameter) -> Refusal:
     if evidence.gap_deg >= 120.0:
         return Refusal("small_arc", f"Only {evidence.arc_deg:.0f}° of the ring seen: {between}.", _REMEDY)
     return Refusal("too_uncertain", f"The points are too few or too scattered; {between}.", _REMEDY)
+
+
+def _too_shallow(found: _Found, spread: Spread) -> Refusal:
+    """Why an arc that is hardly deeper than its noise has no diameter: any curvature would agree with it."""
+    scatter = f"the points scatter by {1000 * spread.sigma_m:.0f} mm"
+    if found.evidence.gap_deg >= 120.0:
+        seen = f"Only {found.evidence.arc_deg:.0f}° of the ring seen and {scatter}"
+        return Refusal("small_arc", f"{seen}: many diameters would agree with that.", _REMEDY)
+    remedy = "Record the stem from nearer, or enter a tape value."
+    return Refusal("too_uncertain", f"The stem is too thin for its points: {scatter}.", remedy)

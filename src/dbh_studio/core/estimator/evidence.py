@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.estimator.fit import CUT, near_surface
 from dbh_studio.core.estimator.posterior import N_OUTLINE
-from dbh_studio.core.estimator.result import Flag
 from dbh_studio.core.estimator.search import find_rings, offsets
 from dbh_studio.core.estimator.tube import Polar, Tube
+from dbh_studio.core.measured import Flag
 from dbh_studio.core.section import ring_coverage
 
+Beside = Literal["", "neighbour", "fork"]
+
+ODD_SHAPE = 0.05
+"""Outlines less round than this (see `oval_of`) may be two stems."""
+
 _FULL_ARC_DEG = 300.0
+_GAP_DEG = 60.0
+_DRIFT_TO_MENTION = 0.75
+_FLUTED = 0.04  # of the fourth wave and up
+_FORK_DEPTH_M = 1.0  # below breast height
 _BIN_COUNTS = (36, 24, 18, 12)
 _POINTS_PER_BIN = 6
 _BIN_SHARE = 0.1
-_WALL_SECTORS = 12
-_WALL_POINTS = 20
-_USUAL_UNEVENNESS = 1.3
-_WALLS_TO_MENTION = 1.8
+_WALL_WINDOWS = 18
+_WALL_WINDOW_RAD = np.pi / 6
+_WALL_POINTS = 15
+_WALL_CUT, _WALL_CUT_M = 5.0, 0.04
 _BULGE_HALF_M = 0.12
 _BUTTRESS_TAPER = 0.03
 _FEW_POINTS = 100
@@ -47,7 +57,8 @@ class Evidence:
         seen: (72,) 1 where the outline is supported.
         stretch_m: Length of stem that was seen.
         off_m: How far breast height is from it; 0 inside.
-        two_walls_m: How far apart two walls are; 0 where there is one.
+        wall_ratio: How many times thicker the layer of points is on its thick sides than on its thin ones.
+        wall_m: By how much, standard deviation.
         bulge_m: How far the stem at breast height stands out of the taper of the rest; negative for a waist.
         bulge_sd_m: Standard deviation of that.
     """
@@ -59,7 +70,8 @@ class Evidence:
     seen: Float64
     stretch_m: float
     off_m: float
-    two_walls_m: float
+    wall_ratio: float
+    wall_m: float
     bulge_m: float
     bulge_sd_m: float
 
@@ -85,34 +97,50 @@ def evidence_of(points: Float64, tube: Tube) -> Evidence | None:
         np.repeat(seen, N_OUTLINE // len(seen)),
         float(high - low),
         float(max(low, -high, 0.0)),
-        _two_walls(near.at, near.error, tube),
+        *_walls(near.at, near.error, tube),
         bulge,
         bulge_sd,
     )
 
 
-def flags_of(evidence: Evidence, tube: Tube, *, lean_deg: float, neighbour: bool) -> tuple[Flag, ...]:
-    """What to look at, in words."""
+def flags_of(
+    evidence: Evidence, tube: Tube, *, lean_deg: float, beside: Beside, drift_chance: float
+) -> tuple[Flag, ...]:
+    """What to look at, in words.
+
+    Args:
+        evidence: Of the tube.
+        tube: As fitted.
+        lean_deg: Of its axis.
+        beside: What stands against it, from `stem_beside`.
+        drift_chance: That passes do not fit together, from `Calibration.drift_chance`.
+    """
     flags = []
     if evidence.arc_deg < _FULL_ARC_DEG:
         flags.append(Flag("partial_arc", f"only {evidence.arc_deg:.0f}° of the ring seen"))
-    if evidence.two_walls_m > _WALLS_TO_MENTION * tube.sigma:
-        flags.append(
-            Flag("double_wall", f"two walls {1000 * evidence.two_walls_m:.0f} mm apart: passes do not fit together")
-        )
+    elif evidence.gap_deg > _GAP_DEG:
+        flags.append(Flag("gap", f"a gap of {evidence.gap_deg:.0f}° in the ring"))
+    if drift_chance > _DRIFT_TO_MENTION:
+        words = f"bark {evidence.wall_ratio:.1f} times thicker on some sides: double wall, passes may not fit together"
+        flags.append(Flag("double_wall", words))
     if abs(evidence.bulge_m) > max(0.03 * tube.radius, 0.004) + 2.0 * evidence.bulge_sd_m:
         word = "bulges out" if evidence.bulge_m > 0 else "is narrower"
-        flags.append(
-            Flag("bulge", f"the stem {word} by {1000 * abs(evidence.bulge_m):.0f} mm here: measure above or below")
-        )
+        words = f"the stem {word} by {1000 * abs(evidence.bulge_m):.0f} mm here (whorl, scar): measure above or below"
+        flags.append(Flag("bulge", words))
     if tube.taper > _BUTTRESS_TAPER:
         flags.append(Flag("buttress", f"thickens by {200 * tube.taper:.0f} cm per metre downwards: root swell"))
+    if float(np.sqrt(0.5 * (tube.waves[4:] ** 2).sum())) > _FLUTED * tube.radius:
+        flags.append(Flag("fluting", "fluted or buttressed: a tape bridges the hollows"))
+    if oval_of(tube) > ODD_SHAPE:
+        flags.append(Flag("not_round", "far from round: two stems in one section, or a very irregular one"))
     if evidence.off_m > _OFF_M:
         flags.append(
             Flag("not_at_height", f"the stem was seen only {100 * evidence.off_m:.0f} cm away from breast height")
         )
-    if neighbour:
+    if beside == "neighbour":
         flags.append(Flag("neighbour", "another stem touches it: see that the points are of this one"))
+    if beside == "fork":
+        flags.append(Flag("fork", "two stems that meet below: a fork; measure each, or below the fork"))
     if evidence.n_points < _FEW_POINTS:
         flags.append(Flag("few_points", f"few points: {evidence.n_points}"))
     if lean_deg > _LEAN_DEG:
@@ -120,6 +148,11 @@ def flags_of(evidence: Evidence, tube: Tube, *, lean_deg: float, neighbour: bool
     if evidence.stretch_m < _SHORT_STRETCH_M:
         flags.append(Flag("short_stretch", f"only {evidence.stretch_m:.1f} m of stem seen: lean and taper are guesses"))
     return tuple(flags)
+
+
+def oval_of(tube: Tube) -> float:
+    """Root mean square of the second and third wave, relative to the radius."""
+    return float(np.sqrt(0.5 * (tube.waves[:4] ** 2).sum())) / tube.radius
 
 
 def _seen(angle: Float64, error: Float64, sigma: float) -> Float64:
@@ -146,24 +179,29 @@ def _arc_and_gap_deg(seen: Float64) -> tuple[float, float]:
     return float(len(at) * width_deg), float(gap * width_deg)
 
 
-def _two_walls(at: Polar, error: Float64, tube: Tube) -> float:
-    """How far apart two walls are where the bark is thicker than elsewhere; 0 where it is nowhere.
+def _walls(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
+    """How many times thicker the bark's layer of points is on its thick sides than on its thin ones, and by how much.
 
-    Passes that do not fit together leave a thick wall where they overlap and thin ones where one of them saw the stem
-    alone. So the second thickest sector is compared with the middle one: a single thick sector may be a stub.
+    Passes that do not fit together leave two walls where they overlap and one where one of them saw the stem alone.
+    Windows of 30° overlap by a third, so that no boundary of windows cuts a double wall in two.
     """
-    on = np.abs(error) < 4.0 * max(tube.sigma, 0.004)
-    sector = np.floor((at.angle()[on] + np.pi) * (_WALL_SECTORS / (2 * np.pi))).astype(np.int64) % _WALL_SECTORS
-    off = error[on]
+    on = np.abs(error) < max(_WALL_CUT * tube.sigma, _WALL_CUT_M)
+    angle, off = at.angle()[on], error[on]
+    order = np.argsort(angle, kind="stable")
+    angle, off = angle[order], off[order]
+    # Once more behind the end, so that a window may pass it.
+    angle, off = np.concatenate([angle, angle + 2 * np.pi]), np.concatenate([off, off])
+    starts = np.arange(_WALL_WINDOWS) * (2 * np.pi / _WALL_WINDOWS) - np.pi
+    firsts, lasts = np.searchsorted(angle, starts), np.searchsorted(angle, starts + _WALL_WINDOW_RAD)
     widths = []
-    for number in range(_WALL_SECTORS):
-        mine = off[sector == number]
-        if len(mine) >= _WALL_POINTS:
-            widths.append(1.4826 * float(np.median(np.abs(mine - np.median(mine)))))
-    if len(widths) < 3:
-        return 0.0
-    thick, usual = float(np.sort(widths)[-2]), float(np.median(widths))
-    return 2.0 * float(np.sqrt(max(thick**2 - (_USUAL_UNEVENNESS * usual) ** 2, 0.0)))
+    for first, last in zip(firsts, lasts, strict=True):
+        if last - first >= _WALL_POINTS:
+            piece = off[first:last]
+            widths.append(1.4826 * float(np.median(np.abs(piece - np.median(piece)))))
+    if len(widths) < 4:
+        return 1.0, 0.0
+    thin, thick = np.quantile(widths, [0.15, 0.9])
+    return float(thick / max(thin, 1e-4)), float(np.sqrt(max(thick**2 - thin**2, 0.0)))
 
 
 def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
@@ -178,24 +216,31 @@ def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
     return height, float(1.25 * tube.sigma / np.sqrt(n_told))
 
 
-def stem_beside(points: Float64, tube: Tube, *, widest_m: float, seed: int) -> bool:
-    """Whether what is outside the tube holds another clean ring that stands against it."""
+def stem_beside(points: Float64, tube: Tube, *, widest_m: float, seed: int) -> Beside:
+    """Whether what is outside the tube holds another clean ring that stands against it, and whether the two meet below.
+
+    Two axes that come together before the ground are one tree's that forks; those of neighbours do not.
+    """
     at = tube.polar(points)
     beyond = at.distance - tube.surface(at)
     rest = points[(beyond > 3.0 * tube.sigma) & (beyond < _NEIGHBOURHOOD_M)]
     if len(rest) < max(_NEIGHBOUR_POINTS, 0.12 * len(points)):
-        return False
+        return ""
     rings, _ = find_rings(rest, widest_m=widest_m, taper=0.0, rng=np.random.default_rng([seed, 203]))
     if not len(rings.radius):
-        return False
+        return ""
     best = rings.at(slice(0, 1))
     radius, sigma = float(best.radius[0]), float(best.sigma[0])
-    apart = float(np.hypot(*(best.middles()[0] - tube.centre)))
+    away = best.middles()[0] - tube.centre
+    apart = float(np.hypot(*away))
     if apart < 0.8 * (radius + tube.radius) or apart > radius + tube.radius + _TOUCHING_M:
-        return False
+        return ""
     _, out_x, out_y, error = (part[0] for part in offsets(best, rest, 0.0))
     on = np.abs(error) < 2.5 * sigma
     around = error < 0.5 * radius
     clean = on.sum() >= max(_NEIGHBOUR_POINTS, _CLEAN_SHARE * around.sum())
     arc_deg, _ = ring_coverage(np.arctan2(out_y[on], out_x[on]))
-    return bool(clean and sigma < 0.15 * radius and arc_deg >= _TOUCHING_ARC_DEG)
+    if not (clean and sigma < 0.15 * radius and arc_deg >= _TOUCHING_ARC_DEG):
+        return ""
+    closer_per_m = float((best.slope[0] - tube.slope) @ away) / apart
+    return "fork" if apart - _FORK_DEPTH_M * closer_per_m < 0.5 * max(radius, tube.radius) else "neighbour"

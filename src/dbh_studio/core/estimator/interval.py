@@ -3,14 +3,17 @@
 The posterior knows the noise and the arc, not what the model leaves out: errors that a whole side shares, walls that do
 not meet, bark a tape bridges. So the standard deviation of the logarithm of the diameter D is taken as
 
-    s² = c₀² + (c₁/D)² + (c₂ h)² + (c₃ σ/D)² + (c₄ q/D)² + (c₅ g² σ/D)² + c₆² (g / (1 - g))³
-         + (c₇ b/D)² + (c₈ d/D)² + (c₉ v)² + s_scale² + (drift/D)²
+    s² = c₀² + (c₁ h)² + (c₂ σ/D)² + c₃² (g / (1 - g))³ + (c₄ b/D)² + p² ((c₅ v)² + (c₆ q/D)² + c₇²) + (c₈ τ²)²
+         + s_scale² + (drift/D)²
 
-with h the posterior's own (half of its 5-95 % range over 1.645), σ the noise of points, q the scatter of patches, g the
-largest gap as a share of the ring, b the bloat taken off with its uncertainty, d the distance of double walls, and v
-the size of the outline's waves relative to the radius (passes that do not fit together look like an odd section). The
-coefficients were found by quantile regression on generated stems with development seeds
-(`bench/estimator_lab.py --calibrate`), c₀ at least 0.005, since bark under a tape alone differs by as much.
+with h the posterior's own (half of its 5-95 % range over 1.645), σ the noise of points, g the largest gap as a share of
+the ring, b the bloat taken off with its uncertainty, and τ the noise relative to how deep the seen arc is
+(`depth_noise`: once that is no longer small, an arc of any curvature agrees with the points). p is the probability
+that passes do not fit together, from how much thicker the bark's layer is on some sides (q) and from the size of the
+outline's waves (v).
+
+The coefficients were found by quantile regression on generated stems with development seeds (`bench/estimator_lab.py
+--calibrate`), c₀ at least 0.005, since bark under a tape alone differs by as much.
 
 Passes that are off by more than their noise and hardly overlap show neither two walls nor an odd section. No estimator
 can see that in the points of one stem; who knows how well the passes fit together has to say so (`drift_m`).
@@ -24,6 +27,8 @@ import numpy as np
 
 from dbh_studio.core.arrays import Float64
 
+_LEAST_WAVE = 0.003
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -32,39 +37,43 @@ class Spread:
     Attributes:
         posterior: Standard deviation of ln D by the posterior.
         sigma_m: Noise of points across the bark.
-        scatter_m: Scatter of patches beyond it.
         gap: Largest unseen sector as a share of the ring, 0-1.
         bloat_m: How far the surface was drawn in, and how uncertain that is.
-        walls_m: Distance of double walls.
-        waves: Root mean square of the outline's waves, relative to its radius.
+        waves: Root mean square of the outline's second and third wave, relative to its radius.
+        wall_ratio: How many times thicker the layer of points is on its thick sides than on its thin ones.
+        wall_m: By how much.
         diameter_m: D.
     """
 
     posterior: float
     sigma_m: float
-    scatter_m: float
     gap: float
     bloat_m: float
-    walls_m: float
     waves: float
+    wall_ratio: float
+    wall_m: float
     diameter_m: float
 
-    def terms(self) -> Float64:
-        """(10,) what the coefficients are multiplied with."""
-        noise = self.sigma_m / self.diameter_m
+    @property
+    def depth_noise(self) -> float:
+        """Noise of points over the depth (sagitta) of the arc seen."""
+        seen = np.pi * (1.0 - min(self.gap, 0.97))
+        return float(self.sigma_m / (0.5 * self.diameter_m * (1.0 - np.cos(seen))))
+
+    def terms(self, drift: float) -> Float64:
+        """(9,) what the coefficients are multiplied with, given the probability that passes do not fit together."""
         gap = min(self.gap, 0.95)
         return np.array(
             [
                 1.0,
-                1.0 / self.diameter_m,
                 self.posterior,
-                noise,
-                self.scatter_m / self.diameter_m,
-                self.gap**2 * noise,
+                self.sigma_m / self.diameter_m,
                 (gap / (1.0 - gap)) ** 1.5,
                 self.bloat_m / self.diameter_m,
-                self.walls_m / self.diameter_m,
-                self.waves,
+                drift * self.waves,
+                drift * self.wall_m / self.diameter_m,
+                drift,
+                self.depth_noise**2,
             ]
         )
 
@@ -74,12 +83,21 @@ class Calibration:
     """How much each term counts.
 
     Attributes:
-        coefficients: (10,) c₀ … c₉; c₁ in metres.
+        coefficients: (9,) c₀ … c₈.
+        drift: Logistic regression of "passes do not fit together": intercept, and slopes on the logarithms of the
+            walls' ratio and of the waves.
         factor: Standard deviations to either end of the 90 % interval.
     """
 
     coefficients: tuple[float, ...]
-    factor: float
+    drift: tuple[float, float, float]
+    factor: float = 1.645
+
+    def drift_chance(self, spread: Spread) -> float:
+        """Probability that passes do not fit together, where half of all stems were so."""
+        start, by_walls, by_waves = self.drift
+        odds = start + by_walls * np.log(spread.wall_ratio) + by_waves * np.log(spread.waves + _LEAST_WAVE)
+        return float(1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0))))
 
     def log_sd(self, spread: Spread, *, scale_sd: float = 0.0, drift_m: float = 0.0) -> float:
         """Standard deviation of ln D.
@@ -91,11 +109,12 @@ class Calibration:
                 each move the radius by half of that, so the diameter by all of it.
         """
         told = scale_sd**2 + (drift_m / spread.diameter_m) ** 2
-        return float(np.sqrt(((np.array(self.coefficients) * spread.terms()) ** 2).sum() + told))
+        terms = spread.terms(self.drift_chance(spread))
+        return float(np.sqrt(((np.array(self.coefficients) * terms) ** 2).sum() + told))
 
 
 CALIBRATIONS = {
-    "ring": Calibration((0.005, 0.0, 1.55, 0.358, 0.0, 7.14, 0.0166, 0.683, 0.692, 0.425), 1.645),
-    "circle": Calibration((0.005, 0.0, 1.7, 0.383, 0.983, 7.99, 0.0253, 1.21, 0.645, 0.0), 1.645),
+    "ring": Calibration((0.0052, 2.22, 0.472, 0.0128, 0.0, 1.4, 1.11, 0.021, 0.323), (2.02, 5.21, 1.54)),
+    "circle": Calibration((0.00632, 2.06, 0.483, 0.0589, 1.02, 0.0, 0.896, 0.0406, 5.02), (-3.57, 5.09, 0.0)),
 }
 """By method."""

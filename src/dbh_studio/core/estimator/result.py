@@ -6,39 +6,8 @@ from dataclasses import dataclass
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.estimator.interval import Spread
+from dbh_studio.core.measured import Diameter, Flag
 from dbh_studio.core.transforms import Similarity
-
-
-@dataclass(frozen=True)
-class Diameter:
-    """A diameter with its 90 % interval, centimetres."""
-
-    value_cm: float
-    low_cm: float
-    high_cm: float
-
-    @property
-    def half_width(self) -> float:
-        """Half the interval's width, relative to the value."""
-        return 0.5 * (self.high_cm - self.low_cm) / self.value_cm
-
-    def holds(self, truth_cm: float) -> bool:
-        """Whether a value is inside."""
-        return self.low_cm <= truth_cm <= self.high_cm
-
-
-@dataclass(frozen=True)
-class Flag:
-    """Something to look at that does not forbid a diameter.
-
-    Attributes:
-        code: ``partial_arc``, ``double_wall``, ``bulge``, ``buttress``, ``not_at_height``, ``neighbour``,
-            ``few_points``, ``lean``, ``short_stretch``, ``fallback``.
-        words: For the forester.
-    """
-
-    code: str
-    words: str
 
 
 @dataclass(frozen=True, eq=False)

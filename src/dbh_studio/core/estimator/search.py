@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from dbh_studio.core.arrays import Bool, Float64, Int64
+from dbh_studio.core.robust import circumcircles
 
 _SLICES = 5
 _HYPOTHESES = 80  # per slice
@@ -130,7 +131,8 @@ def _slice_circles(xy: Float64, n_hypotheses: int, widest_m: float, rng: np.rand
     far = apart > (_REACHES_M[np.arange(n_hypotheses) % len(_REACHES_M)] ** 2)[:, None]
     pair = np.argsort(far, axis=1, kind="stable")[:, :2]
     second, third = np.take_along_axis(others, pair, axis=1).T
-    circles = _through(xy[first], xy[second], xy[third])
+    centres, radii = circumcircles(np.stack([xy[first], xy[second], xy[third]], axis=1))
+    circles = np.column_stack([centres, radii])
     circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] > _SMALLEST_M) & (circles[:, 2] < widest_m)]
     if not len(circles):
         return circles
@@ -146,16 +148,6 @@ def _slice_circles(xy: Float64, n_hypotheses: int, widest_m: float, rng: np.rand
 
 def _apart(one: Float64, other: Float64) -> float:
     return float(np.hypot(one[0] - other[0], one[1] - other[1]) + abs(one[2] - other[2]))
-
-
-def _through(a: Float64, b: Float64, c: Float64) -> Float64:
-    """(H, 3) centre and radius of circles through three (H, 2) points; not finite where these are on a line."""
-    p, q = (b - a).T, (c - a).T
-    doubled = 2.0 * (p[0] * q[1] - p[1] * q[0])
-    p2, q2 = p[0] ** 2 + p[1] ** 2, q[0] ** 2 + q[1] ** 2
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        x, y = (q[1] * p2 - p[1] * q2) / doubled, (p[0] * q2 - q[0] * p2) / doubled
-        return np.column_stack([a[:, 0] + x, a[:, 1] + y, np.sqrt(x * x + y * y)])
 
 
 def _slice_score(x: Float64, y: Float64, circles: Float64) -> Float64:
