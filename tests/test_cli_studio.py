@@ -36,14 +36,16 @@ def las(tmp_path_factory) -> Path:
     return path
 
 
+_TALKING = {
+    "stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True,
+    "encoding": "utf-8",
+}  # fmt: skip
+
+
 def start(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "dbh_studio", "open", "--no-browser", *map(str, arguments)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        encoding="utf-8",
+        **_TALKING,
     )
 
 
@@ -63,10 +65,10 @@ def test_open_serves_the_plot_to_who_has_the_link_and_ends_politely(las):
             url = url_of(process)
             assert f"kept in {las.with_suffix('.dbh')}" in process.stdout.readline() + process.stdout.readline()
             browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(http.cookiejar.CookieJar()))
-            with browser.open(url, timeout=30) as page:
+            with browser.open(url, timeout=120) as page:
                 assert page.status == 200 and b"<html" in page.read().lower()
             with pytest.raises(urllib.error.HTTPError) as refused:
-                urllib.request.urlopen(url.partition("?")[0], timeout=30)
+                urllib.request.urlopen(url.partition("?")[0], timeout=120)
             assert refused.value.code == 401
             refused.value.close()
             # A second one, of the same plot: told at once, by whom it is held, and what to do.
@@ -78,10 +80,10 @@ def test_open_serves_the_plot_to_who_has_the_link_and_ends_politely(las):
                 assert url_of(third) != url
                 third.send_signal(signal.SIGINT if can_interrupt() else signal.SIGTERM)
                 said = third.stdout.read()
-                assert third.wait(timeout=60) == 0 and "reading only" in said
+                assert third.wait(timeout=120) == 0 and "reading only" in said
         finally:
             process.terminate()
-        _, message = process.communicate(timeout=60)
+        _, message = process.communicate(timeout=120)
     assert process.returncode == 0 and "Traceback" not in message
     saved = las.with_suffix(".dbh")
     assert read_project(saved).source_path == las
@@ -225,15 +227,15 @@ def test_the_demo_is_served(out):
         "from dbh_studio.cli import main\nsys.exit(main(sys.argv[1:]))"
     )
     arguments = [sys.executable, "-c", program, "demo", "--no-browser", "--quiet", "--out", str(out)]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(arguments, **_TALKING) as process:
         try:
             url = url_of(process)
             with pytest.raises(urllib.error.HTTPError) as refused:
-                urllib.request.urlopen(url.partition("?")[0], timeout=30)
+                urllib.request.urlopen(url.partition("?")[0], timeout=120)
             refused.value.close()
         finally:
             process.terminate()
-        _, message = process.communicate(timeout=60)
+        _, message = process.communicate(timeout=120)
     assert process.returncode == 0 and message.count("\n") <= 1
 
 

@@ -40,3 +40,19 @@ def test_one_setting_out_of_its_own_bounds_is_still_named_alone():
     with pytest.raises(SettingError, match=r"Search from \(slab_low_m\)") as caught:
         TrunkSettings().changed(slab_low_m=50.0)
     assert "50" in caught.value.remedy
+
+
+def test_a_plot_saved_before_there_were_intervals_keeps_its_method():
+    """Every setting is in a saved plot: a new default changes no old number, and new settings take theirs."""
+    new = ("max_half_width", "roundness", "bark_share", "bloat_chance")
+    saved = {name: value for name, value in MeasureSettings().model_dump().items() if name not in new}
+    saved |= {"curve": "fourier", "definition": "curve"}
+    opened = Settings.model_validate({"measure": saved}).measure
+    assert (opened.curve, opened.definition) == ("fourier", "curve")
+    assert (MeasureSettings().curve, MeasureSettings().definition) == ("shrinkage", "tape")
+    assert opened == MeasureSettings(curve="fourier", definition="curve")
+
+
+def test_the_papers_way_in_one_word():
+    paper = MeasureSettings.paper()
+    assert (paper.curve, paper.definition, paper.ring_gate, paper.tolerance_share) == ("fourier", "curve", 0.0, 0.0)

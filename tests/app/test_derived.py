@@ -68,11 +68,15 @@ def test_every_input_of_a_measurement_is_in_its_key():
 
 def test_a_scale_of_the_same_size_from_elsewhere_measures_nothing_again():
     session, stages = make_session(n_trunks=2)
+    session.do(commands.set_scale(ScaleEstimate(1.0, "bars", 0.01)))
     session.measurements()
     session.do(commands.set_scale(ScaleEstimate(1.0, "marker", 0.01)))
     stages.measured.clear()
     rows = session.inventory().rows
     assert stages.measured == []
+    session.do(commands.set_scale(ScaleEstimate(1.0, "marker", 0.02)))  # which every interval has in it
+    session.measurements()
+    assert stages.measured == [1, 2]
     assert rows[0].scale_source == "marker" and rows[0].scale_err_pct == pytest.approx(1.0)
 
 

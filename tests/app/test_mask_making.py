@@ -447,7 +447,7 @@ def test_brought_masks_are_taken_over_to_be_painted(plot, session):
     put_painted(session, posed.images[0], TrunkMask(np.zeros((512, 1024), np.uint16)))
     assert take_over_brought(session, masks, posed) == ()
     kept = plot_masks(session, posed)
-    assert len(kept) == N_PHOTOS and "1 of them were painted by hand." in kept.notes
+    assert len(kept) == N_PHOTOS and "1 of them painted by hand." in kept.notes
     assert not kept.mask("00.jpg").labels.any()
     same = kept.mask("01.jpg"), masks.mask("01.jpg")
     assert np.array_equal(same[0].labels, same[1].labels) and same[0].has_instances

@@ -108,7 +108,7 @@ def test_in_the_background_commands_do_not_wait_and_are_all_there_after_a_flush(
     def slow(self, state, **options):
         nonlocal n_saves
         n_saves += 1
-        may_save.wait(60)
+        may_save.wait(120)
         save(self, state, **options)
 
     monkeypatch.setattr(ProjectWriter, "save", slow)
@@ -135,10 +135,10 @@ def test_a_failed_background_save_is_tried_again_with_the_next_command(tmp_path,
     with monkeypatch.context() as patch:
         patch.setattr(ProjectWriter, "save", _fail)
         session.do(commands.delete_trunk(1))
-        assert reached["not_saved"].wait(30)
+        assert reached["not_saved"].wait(120)
     assert saver.status.problem == "The plot could not be saved (something unforeseen)."
     session.do(commands.delete_trunk(2))
-    assert reached["saved"].wait(30)
+    assert reached["saved"].wait(120)
     assert read_project(folder).trunks.ids == (3, 4, 5)
     session.close()
 
@@ -188,7 +188,7 @@ def test_an_edit_during_the_first_save_is_saved(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ProjectWriter, "save", slow)
     saver = keep(session, folder, background=True)
-    editor.join(30)
+    editor.join(120)
     assert saver.flush()
     assert read_project(folder).trunks.ids == (2, 3, 4, 5)
     assert history(folder) == ["Create the plot", "Delete trunk 1"]

@@ -1,6 +1,7 @@
 """`map_in_threads`: the results of `map`, from two threads. `CallAhead`: a call begun before it is wanted."""
 
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from dbh_studio.app.threads import CallAhead, map_in_threads
 from dbh_studio.core.progress import ignore_progress
 from dbh_studio.errors import CancelledError
+
+PATIENCE_S = 120.0
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 50])
@@ -17,7 +20,7 @@ def test_results_come_in_the_order_of_the_items(n):
 
 def test_two_calls_run_at_once():
     # Each waits for the other: alone, the first would never return.
-    together = threading.Barrier(2, timeout=30)
+    together = threading.Barrier(2, timeout=PATIENCE_S)
     list(map_in_threads(lambda _: together.wait(), range(8)))
 
 
@@ -39,12 +42,13 @@ def test_an_error_comes_out_after_the_results_before_it_and_ends_the_work():
 
 
 def test_what_nobody_waits_for_is_not_begun():
-    called = []
+    called, before = [], set(threading.enumerate())
     results = map_in_threads(lambda i: called.append(i), range(100))
     next(results)
     results.close()
     assert len(called) <= 5
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("ThreadPoolExecutor")]
+    left = set(threading.enumerate()) - before
+    assert not [thread for thread in left if thread.name.startswith("ThreadPoolExecutor")]
 
 
 def test_a_call_made_ahead_is_made_once_and_reports_to_who_waits_for_it():
@@ -53,7 +57,7 @@ def test_a_call_made_ahead_is_made_once_and_reports_to_who_waits_for_it():
 
     def total(points, factor, *, progress):
         called.append(factor)
-        assert is_wanted.wait(30)
+        assert is_wanted.wait(PATIENCE_S)
         progress(0.5, "half")
         return factor * float(points.sum())
 
@@ -63,7 +67,13 @@ def test_a_call_made_ahead_is_made_once_and_reports_to_who_waits_for_it():
     points = np.arange(4.0)
     ahead = CallAhead()
     ahead.begin(total, points, 2.0)
-    threading.Timer(0.2, is_wanted.set).start()
+
+    def go_on_when_it_is_waited_for():
+        while ahead._progress is not begin_to_wait:
+            time.sleep(0.001)
+        is_wanted.set()
+
+    threading.Thread(target=go_on_when_it_is_waited_for, daemon=True).start()
     assert ahead.call(total, points, 2.0, progress=begin_to_wait) == 12.0
     assert called == [2.0] and reports == [(0.5, "half")]
 
@@ -99,7 +109,7 @@ def test_another_call_than_the_one_begun_is_made_anew_and_the_begun_one_stops(ch
 
         with pytest.raises(CancelledError):
             ahead.call(endless, *arguments, progress=once)
-    assert stopped.wait(30)
+    assert stopped.wait(PATIENCE_S)
 
 
 def test_an_error_within_gives_the_call_up_and_its_own_error_comes_out_of_it():
@@ -115,7 +125,7 @@ def test_an_error_within_gives_the_call_up_and_its_own_error_comes_out_of_it():
     with pytest.raises(KeyError), CallAhead() as ahead:
         ahead.begin(endless)
         raise KeyError
-    assert stopped.wait(30)
+    assert stopped.wait(PATIENCE_S)
 
     def fails(*, progress):
         raise ValueError("no points")

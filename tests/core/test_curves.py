@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.special import ellipe
 
-from dbh_studio.core.curves import CURVES, BSpline, Ellipse, Fourier
+from dbh_studio.core.curves import CURVE_WORDS, CURVES, BSpline, Ellipse, Fourier
 from dbh_studio.core.curves.alpha import alpha_boundaries
 from dbh_studio.core.curves.base import contains, distance_to_outline, outline_centroid, outline_metrics
+from dbh_studio.core.interval_methods import INTERVAL_METHODS
 from dbh_studio.settings import CurveName, MeasureSettings
 
 
@@ -29,7 +30,8 @@ def perimeter_of(curve, uv):
 
 
 def test_registry_has_every_name_a_setting_can_take():
-    assert set(CURVES) == set(CurveName.__args__)
+    assert set(CURVES) | set(INTERVAL_METHODS) == set(CurveName.__args__) == set(CURVE_WORDS)
+    assert not set(CURVES) & set(INTERVAL_METHODS)
     assert all(curve.name == name for name, curve in CURVES.items())
 
 

@@ -11,10 +11,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipe
 
+from dbh_studio.core import dbh
 from dbh_studio.core.curves import CURVES
-from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal, measure_stem
+from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal
 from dbh_studio.core.quality import disagreement_of
 from dbh_studio.settings import MeasureSettings
+
+
+def paper(**values) -> MeasureSettings:
+    """The paper's Fourier curve and perimeter/π, with some settings changed: what these tests are about."""
+    return MeasureSettings(**{"curve": "fourier", "definition": "curve", **values})
+
+
+def measure_stem(points, *, settings=None, **others):
+    """As `dbh.measure_stem`, by Fourier where nothing else is said."""
+    return dbh.measure_stem(points, settings=paper() if settings is None else settings, **others)
+
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 
@@ -59,7 +71,7 @@ class TestTruth:
     @pytest.mark.parametrize("name", CURVES)
     @pytest.mark.parametrize("radius", [0.06, 0.2, 0.6])
     def test_circle(self, name, radius):
-        result = measure_stem(stem(circle(radius)), settings=MeasureSettings(curve=name))
+        result = measure_stem(stem(circle(radius)), settings=paper(curve=name))
         assert isinstance(result, DbhEstimate)
         assert result.dbh_cm == pytest.approx(200 * radius, rel=TOLERANCE[name] * max(1.0, 0.2 / radius))
         assert result.curve == name
@@ -68,7 +80,7 @@ class TestTruth:
     @pytest.mark.parametrize("b", [0.18, 0.15])
     def test_ellipse(self, name, b):
         truth = 100 * 4 * 0.2 * ellipe(1 - (b / 0.2) ** 2) / np.pi
-        result = measure_stem(stem(ellipse(0.2, b)), settings=MeasureSettings(curve=name))
+        result = measure_stem(stem(ellipse(0.2, b)), settings=paper(curve=name))
         assert result.dbh_cm == pytest.approx(truth, rel=0.004)
 
     def test_fourier_shape(self):
@@ -78,19 +90,17 @@ class TestTruth:
     @pytest.mark.parametrize("lean_deg", [5.0, 20.0, 40.0])
     def test_leaning_stem_is_measured_across_itself(self, name, lean_deg):
         """A horizontal section of a 20° lean would read 3 % more, of 40° 15 %."""
-        result = measure_stem(stem(circle(), lean_deg=lean_deg), settings=MeasureSettings(curve=name))
+        result = measure_stem(stem(circle(), lean_deg=lean_deg), settings=paper(curve=name))
         assert result.dbh_cm == pytest.approx(40.0, rel=0.004)
         assert any("leans" in flag for flag in result.flags) == (lean_deg > 10)
 
     def test_upright_axis_reads_a_leaning_stem_too_thick(self):
-        result = measure_stem(stem(circle(), lean_deg=30.0), settings=MeasureSettings(axis="vertical"))
+        result = measure_stem(stem(circle(), lean_deg=30.0), settings=paper(axis="vertical"))
         assert result.dbh_cm > 41.0
 
     def test_definitions(self):
         points = stem(ellipse(0.2, 0.12))
-        found = {
-            d: measure_stem(points, settings=MeasureSettings(definition=d)).dbh_cm for d in ("curve", "tape", "area")
-        }
+        found = {d: measure_stem(points, settings=paper(definition=d)).dbh_cm for d in ("curve", "tape", "area")}
         assert found["area"] == pytest.approx(200 * np.sqrt(0.2 * 0.12), rel=0.01)
         assert found["area"] < found["tape"] <= found["curve"] * (1 + 1e-9)
 
@@ -99,7 +109,7 @@ class TestTruth:
             r = 0.2 * (1 + 0.3 * np.cos(2 * t))
             return np.stack([r * np.cos(t), r * np.sin(t)], axis=1)
 
-        loose = MeasureSettings(ring_gate=0.0, ransac_tolerance_m=0.1, tolerance_share=0.0)
+        loose = paper(ring_gate=0.0, ransac_tolerance_m=0.1, tolerance_share=0.0)
         fit = measure_stem(stem(peanut), settings=loose).fits["fourier"]
         assert fit.diameter_m("tape") < 0.999 * fit.diameter_m("curve")
 
@@ -169,7 +179,7 @@ class TestHardInput:
 
 
 def refused(points, **options):
-    result = measure_stem(points, settings=MeasureSettings(**options))
+    result = measure_stem(points, settings=paper(**options))
     assert isinstance(result, Refusal)
     assert not result
     assert result.reason.endswith(".")
@@ -223,7 +233,7 @@ class TestRefusals:
         assert refusal.section.coverage_deg < 90
 
     def test_arc_of_90_degrees_is_at_best_poor(self):
-        result = measure_stem(stem(circle(), arc_deg=90, noise=0.004), settings=MeasureSettings(min_coverage_deg=60))
+        result = measure_stem(stem(circle(), arc_deg=90, noise=0.004), settings=paper(min_coverage_deg=60))
         assert not result or result.quality == "poor"
 
     def test_diameter_beyond_the_limits(self):
@@ -282,7 +292,7 @@ class TestQuality:
         assert disagreement_of(0.9, [1.0, 1.0, 1.4]) == pytest.approx(0.1)
 
     def test_disagreement_is_flagged(self):
-        result = measure_stem(stem(circle(), noise=0.02), settings=MeasureSettings(curve="bspline"))
+        result = measure_stem(stem(circle(), noise=0.02), settings=paper(curve="bspline"))
         (flag,) = (flag for flag in result.flags if flag.startswith("curves disagree by"))
         assert "Fourier" in flag and "B-spline" in flag and "ellipse" in flag
 
@@ -295,20 +305,19 @@ class TestChoices:
         assert alone.dbh_cm == measure_stem(points).dbh_cm
 
     def test_all_by_default(self):
-        assert list(measure_stem(stem(circle()), settings=MeasureSettings(curve="ellipse")).fits) == [
+        assert list(measure_stem(stem(circle()), settings=paper(curve="ellipse")).fits) == [
             "ellipse", "fourier", "bspline",
         ]  # fmt: skip
 
     def test_paper_exactly(self):
         """No gate, fixed tolerance: on a clean ring the departures change nothing."""
         points = stem(circle())
-        paper = MeasureSettings(ring_gate=0.0, tolerance_share=0.0, polar_origin="centroid")
-        assert measure_stem(points, settings=paper).dbh_cm == pytest.approx(40.0, rel=0.003)
+        assert measure_stem(points, settings=MeasureSettings.paper()).dbh_cm == pytest.approx(40.0, rel=0.003)
 
     def test_polar_origin_at_the_centroid_reads_half_a_noisy_ring_less_well(self):
         ring, centroid = (
             np.median([
-                abs(measure_stem(points, settings=MeasureSettings(polar_origin=origin), curves=()).dbh_cm - 40.0)
+                abs(measure_stem(points, settings=paper(polar_origin=origin), curves=()).dbh_cm - 40.0)
                 for points in (stem(circle(), n=12_000, arc_deg=180, noise=0.02, seed=seed) for seed in range(8))
             ])
             for origin in ("ring", "centroid")
@@ -343,8 +352,8 @@ class TestProperties:
     @settings(max_examples=10, deadline=None)
     @given(scale=st.floats(0.4, 3.0))
     def test_diameter_is_linear_in_scale(self, scale):
-        base = MeasureSettings()
-        scaled = MeasureSettings(
+        base = paper()
+        scaled = paper(
             breast_height_m=1.3 * scale, band_below_m=0.08 * scale, band_above_m=0.22 * scale,
             ransac_tolerance_m=0.05 * scale,
         )  # fmt: skip
@@ -355,7 +364,7 @@ class TestProperties:
     @settings(max_examples=25, deadline=None)
     @given(points=st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(1.22, 1.52)), max_size=60))
     def test_never_zero_and_never_an_exception(self, points):
-        result = measure_stem(np.array(points, float).reshape(-1, 3), settings=MeasureSettings(min_points=8))
+        result = measure_stem(np.array(points, float).reshape(-1, 3), settings=paper(min_points=8))
         if result:
             assert 2.0 <= result.dbh_cm <= 300.0
             assert np.isfinite(result.position_m).all()

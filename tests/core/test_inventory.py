@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal
+from dbh_studio.core.dbh import CurveFit, DbhEstimate, Diameter, Refusal
 from dbh_studio.core.inventory import COLUMNS, Inventory, MapPosition, TreeRecord, inventory_row
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.section import CrossSection
@@ -62,10 +64,34 @@ def test_a_measured_stem_fills_its_row():
     assert (row.dbh_cm, row.dbh_method, row.dbh_definition, row.hom_m) == (31.4159, "fourier", "tape", 1.37)
     assert (row.coverage_deg, row.max_gap_deg, row.n_points, row.lean_deg) == (300.0, 60.0, 7, 4.25)
     assert row.rmse_mm == pytest.approx(4.2)
+    assert (row.dbh_lo_cm, row.dbh_hi_cm, row.taper_cm_per_m) == (None, None, None)  # a curve of the paper has none
+    assert row.dbh_curve_cm == pytest.approx(98.0 / np.pi) and row.dbh_tape_cm == pytest.approx(97.0 / np.pi)
     assert (row.quality, row.reason, row.remedy, row.edited) == ("fair", "small arc; curves differ", "", True)
     assert (row.x_m, row.y_m, row.z_ground_m, row.note) == (1.5, -2.25, 0.125, "fork")
     assert row.scale_source == "marker" and row.scale_err_pct == pytest.approx(0.5)
     assert (row.easting, row.northing, row.epsg) == (None, None, None)
+
+
+def test_an_interval_and_the_other_definitions_fill_their_columns():
+    fit = make_estimate().fits["fourier"]
+    diameters = {
+        "tape": Diameter(31.9, 30.8, 33.0),
+        "curve": Diameter(31.7, 30.6, 32.8),
+        "area": Diameter(31.6, 30.5, NAN),
+    }
+    estimate = replace(
+        make_estimate(dbh_cm=31.9, flags=("only 200° of the ring seen",)),
+        curve="shrinkage",
+        fits={"shrinkage": replace(fit, curve="shrinkage", diameters=diameters)},
+        flag_codes=("partial_arc", "lean"),
+        taper_cm_per_m=1.5,
+    )
+    row = make_row(estimate)
+    assert (row.dbh_cm, row.dbh_lo_cm, row.dbh_hi_cm) == (31.9, 30.8, 33.0)
+    assert (row.dbh_tape_cm, row.dbh_tape_lo_cm, row.dbh_tape_hi_cm) == (31.9, 30.8, 33.0)
+    assert (row.dbh_curve_cm, row.dbh_curve_lo_cm, row.dbh_curve_hi_cm) == (31.7, 30.6, 32.8)
+    assert (row.dbh_area_cm, row.dbh_area_lo_cm, row.dbh_area_hi_cm) == (31.6, 30.5, None)
+    assert (row.flags, row.taper_cm_per_m, row.dbh_method) == ("partial_arc;lean", 1.5, "shrinkage")
 
 
 def test_a_refused_stem_has_a_reason_and_a_remedy_and_no_number():
@@ -74,6 +100,7 @@ def test_a_refused_stem_has_a_reason_and_a_remedy_and_no_number():
     assert numbers == (None,) * 6
     assert (row.quality, row.reason, row.remedy) == ("refused", "Only 4 points at 1.3 m.", "Walk closer.")
     assert (row.dbh_method, row.dbh_definition, row.n_points) == ("", "", None)
+    assert (row.flags, row.dbh_tape_cm, row.dbh_lo_cm, row.taper_cm_per_m) == ("too_few_points", None, None, None)
     with_section = make_row(Refusal("small_arc", "A small arc.", "Walk round it.", make_section(coverage_deg=80.0)))
     assert with_section.dbh_cm is None and with_section.coverage_deg == 80.0 and with_section.hom_m == 1.37
     assert with_section.n_points == 9
@@ -126,7 +153,9 @@ def test_a_record_holds_only_what_it_can(fields):
 
 def test_columns_are_a_promise():
     assert ",".join(COLUMNS) == (
-        "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_method,dbh_definition,hom_m,coverage_deg,max_gap_deg,"
-        "rmse_mm,n_points,lean_deg,quality,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,note,"
+        "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_lo_cm,dbh_hi_cm,dbh_method,dbh_definition,"
+        "dbh_tape_cm,dbh_tape_lo_cm,dbh_tape_hi_cm,dbh_curve_cm,dbh_curve_lo_cm,dbh_curve_hi_cm,"
+        "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,hom_m,coverage_deg,max_gap_deg,"
+        "rmse_mm,n_points,lean_deg,taper_cm_per_m,quality,flags,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,note,"
         "easting,northing,epsg"
     )

@@ -9,6 +9,8 @@ from dbh_studio.core.dbh import axis_of_stem, measure_stem
 from dbh_studio.core.section import ring_coverage
 from dbh_studio.settings import MeasureSettings
 
+FOURIER = MeasureSettings(curve="fourier")
+
 
 def stem(radius=0.2, n=4000, lean_deg=0.0, toward_deg=0.0, z=(0.3, 3.0), noise=0.003, arc_deg=360.0, taper=0.0, seed=0):
     """A leaning (tapered) cylinder whose axis passes the origin."""
@@ -74,7 +76,7 @@ class TestAxis:
 class TestSection:
     def test_frame_band_and_height(self):
         points = stem(lean_deg=20.0, toward_deg=40.0) + np.array([3.0, -2.0, 0.0])
-        section = measure_stem(points).section
+        section = measure_stem(points, settings=FOURIER).section
         assert section.band_m == pytest.approx((1.22, 1.52))
         assert section.hom_m == pytest.approx(1.37)
         assert section.lean_deg == pytest.approx(20.0, abs=0.3)
@@ -88,25 +90,25 @@ class TestSection:
 
     def test_holds_every_point_of_the_band_and_no_other(self):
         points = stem()
-        section = measure_stem(points).section
+        section = measure_stem(points, settings=FOURIER).section
         inside = (points[:, 2] >= 1.22) & (points[:, 2] <= 1.52)
         assert sorted(section.indices) == np.flatnonzero(inside).tolist()
 
     @pytest.mark.parametrize("breast_height_m", [1.30, 1.37, 1.40])
     def test_breast_height_moves_the_band(self, breast_height_m):
-        section = measure_stem(stem(), settings=MeasureSettings(breast_height_m=breast_height_m)).section
+        section = measure_stem(stem(), settings=FOURIER.changed(breast_height_m=breast_height_m)).section
         assert section.band_m == pytest.approx((breast_height_m - 0.08, breast_height_m + 0.22))
         assert section.hom_m == pytest.approx(breast_height_m + 0.07)
 
     def test_ring_and_what_is_near_it(self):
         fern = np.random.default_rng(0).uniform([0.5, -0.3, 1.2], [0.8, 0.3, 1.55], (100, 3))
-        section = measure_stem(np.concatenate([stem(), fern])).section
+        section = measure_stem(np.concatenate([stem(), fern]), settings=FOURIER).section
         assert section.ring_radius_m == pytest.approx(0.2, rel=0.01)
         assert section.near_ring[section.indices < 4000].all()
         assert not section.near_ring[section.indices >= 4000].any()
 
     def test_arrays_are_read_only(self):
-        section = measure_stem(stem()).section
+        section = measure_stem(stem(), settings=FOURIER).section
         for array in (section.uv_m, section.indices, section.near_ring):
             assert not array.flags.writeable
 

@@ -126,7 +126,7 @@ def test_an_updated_baseline_passes_its_own_gate_and_keeps_other_plots(bench):
 def test_a_run_is_timed_weighed_and_stopped(bench, tmp_path):
     run = sys.modules["bench_process"].run
     ballast = np.ones(40_000_000)  # what this process holds must not count
-    code = "import time; x = b'1' * 80_000_000; time.sleep(0.5); print('done')"
+    code = "import time; x = b'1' * 80_000_000; time.sleep(1.5); print('done')"  # long enough to be looked at
     done = run([sys.executable, "-c", code], limit_s=60, log=tmp_path / "log")
     assert done.exit_code == 0 and "done" in done.output
     if done.peak_mb is not None:

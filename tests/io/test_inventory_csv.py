@@ -30,15 +30,28 @@ MEASURED = InventoryRow(
     status="live",
     species="Fagus sylvatica",
     dbh_cm=31.41593,
-    dbh_method="fourier",
+    dbh_lo_cm=30.2,
+    dbh_hi_cm=32.65,
+    dbh_method="shrinkage",
     dbh_definition="curve",
+    dbh_tape_cm=31.7,
+    dbh_tape_lo_cm=30.5,
+    dbh_tape_hi_cm=32.96,
+    dbh_curve_cm=31.41593,
+    dbh_curve_lo_cm=30.2,
+    dbh_curve_hi_cm=32.65,
+    dbh_area_cm=31.3,
+    dbh_area_lo_cm=30.1,
+    dbh_area_hi_cm=32.5,
     hom_m=1.37,
     coverage_deg=300.04,
     max_gap_deg=59.96,
     rmse_mm=4.25,
     n_points=812,
     lean_deg=3.14,
+    taper_cm_per_m=1.234,
     quality="good",
+    flags="",
     reason="",
     remedy="",
     edited=False,
@@ -60,6 +73,17 @@ REFUSED = replace(
     status="",
     species="Weißtanne",
     dbh_cm=None,
+    dbh_lo_cm=None,
+    dbh_hi_cm=None,
+    dbh_tape_cm=None,
+    dbh_tape_lo_cm=None,
+    dbh_tape_hi_cm=None,
+    dbh_curve_cm=None,
+    dbh_curve_lo_cm=None,
+    dbh_curve_hi_cm=None,
+    dbh_area_cm=None,
+    dbh_area_lo_cm=None,
+    dbh_area_hi_cm=None,
     dbh_method="",
     dbh_definition="",
     hom_m=None,
@@ -68,7 +92,9 @@ REFUSED = replace(
     rmse_mm=None,
     n_points=4,
     lean_deg=None,
+    taper_cm_per_m=None,
     quality="refused",
+    flags="too_few_points",
     reason="Only 4 points at 1.3 m.",
     remedy="Walk closer.",
     edited=True,
@@ -83,12 +109,16 @@ REFUSED = replace(
 )
 
 GOLDEN = (
-    "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_method,dbh_definition,hom_m,coverage_deg,max_gap_deg,rmse_mm,"
-    "n_points,lean_deg,quality,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,note,easting,northing,"
-    "epsg\n"
-    "Stand 4,1,1,A-7,live,Fagus sylvatica,31.42,fourier,curve,1.370,300.0,60.0,4.2,812,3.1,good,,,false,1.500,-2.250,"
+    "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_lo_cm,dbh_hi_cm,dbh_method,dbh_definition,"
+    "dbh_tape_cm,dbh_tape_lo_cm,dbh_tape_hi_cm,dbh_curve_cm,dbh_curve_lo_cm,dbh_curve_hi_cm,"
+    "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,hom_m,coverage_deg,max_gap_deg,rmse_mm,"
+    "n_points,lean_deg,taper_cm_per_m,quality,flags,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,"
+    "note,easting,northing,epsg\n"
+    "Stand 4,1,1,A-7,live,Fagus sylvatica,31.42,30.20,32.65,shrinkage,curve,31.70,30.50,32.96,31.42,30.20,32.65,"
+    "31.30,30.10,32.50,1.370,300.0,60.0,4.2,812,3.1,1.23,good,,,,false,1.500,-2.250,"
     '0.000,marker,0.150,"low fork, ""twin""",500001.500,4499997.750,32633\n'
-    "Stand 4,2,2,'=HYPERLINK(1),,Weißtanne,,,,,,,,4,,refused,Only 4 points at 1.3 m.,Walk closer.,true,,,,marker,,,,,\n"
+    "Stand 4,2,2,'=HYPERLINK(1),,Weißtanne,,,,,,,,,,,,,,,,,,,4,,,refused,too_few_points,Only 4 points at 1.3 m.,"
+    "Walk closer.,true,,,,marker,,,,,\n"
 ).encode()
 
 

@@ -153,7 +153,13 @@ def test_the_papers_otsu_drops_thin_stems_and_the_default_does_not() -> None:
 def test_rules_for_small_clusters() -> None:
     size, rings = np.array([9000.0, 400.0, 8000.0, 6.0, 11.0]), np.array([True, True, True, False, False])
     assert keep_clusters(size, rings, TrunkSettings())[0].tolist() == [True, True, True, False, False]
-    assert keep_clusters(size, rings, TrunkSettings(small_clusters="otsu"))[0].tolist() == [True, False, True, False, False]
+    assert keep_clusters(size, rings, TrunkSettings(small_clusters="otsu"))[0].tolist() == [
+        True,
+        False,
+        True,
+        False,
+        False,
+    ]
     assert keep_clusters(size, rings, TrunkSettings(small_clusters="keep"))[0].all()
     assert keep_clusters(np.empty(0), np.empty(0, bool), TrunkSettings())[0].shape == (0,)
 

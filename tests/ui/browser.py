@@ -12,10 +12,12 @@ take the fixture `chromium`, which is one browser for all test files::
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
+from fakeclient import until_ended
 
 LAUNCH_ARGUMENTS = (
     "--headless=new",
@@ -30,7 +32,8 @@ LAUNCH_ARGUMENTS = (
     "--disable-component-update",
     "--disable-sync",
 )
-TIMEOUT_MS = 60_000
+TIMEOUT_MS = 120_000
+_serials = itertools.count(1)
 
 _PIXEL = """point => {
   const m = window.__viserMutable, camera = m.camera, box = m.canvas.getBoundingClientRect();
@@ -82,6 +85,22 @@ def wait_for_points(page: Any, n_points: int) -> None:
     page.wait_for_function("n => window.__viserTestpoints.rendererInfo.render.points >= n", arg=n_points)
 
 
+def settle(page: Any, studio: Any) -> None:
+    """Wait until the studio has dealt with all that was done in the page, and the page has drawn what came of it."""
+    until_ended("stream")
+    serial = next(_serials)
+    for tab in list(studio._tabs.values()):
+
+        def answer(payload: Any, tab: Any = tab) -> None:
+            tab.bridge.run(f"window.dbhSettled = {int(payload)};")
+            tab.client.flush()
+
+        tab.bridge.on("settled?", answer)  # it takes its turn in the tab's queue
+    page.evaluate("serial => window.dbh('settled?', serial)", serial)
+    page.wait_for_function("serial => window.dbhSettled === serial", arg=serial)
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
+
+
 def pixel_of(page: Any, point: Sequence[float]) -> tuple[float, float]:
     """Where a world point is on the page, in CSS pixels."""
     x, y = page.evaluate(_PIXEL, [float(c) for c in point])
@@ -90,8 +109,11 @@ def pixel_of(page: Any, point: Sequence[float]) -> tuple[float, float]:
 
 def close_notifications(page: Any) -> None:
     """Close what covers the upper left corner (the page warns of software drawing there)."""
-    page.evaluate("() => document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())")
-    page.wait_for_timeout(400)  # they fade
+    close = """() => {
+      document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click());
+      return document.querySelectorAll('.mantine-Notification-closeButton').length === 0;
+    }"""
+    page.wait_for_function(close, polling=100)  # they fade
 
 
 def handle_selector(handle: Any) -> str:

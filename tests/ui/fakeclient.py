@@ -13,11 +13,15 @@ Use it like a person uses the page. ``url`` is `StudioServer.url`, token include
         tab.upload("Upload a cloud", "plot.ply", b"...")  # in 512 KB parts, as the page does
         tab.bridge_send("row", 3)                         # what page JavaScript does with dbh('row', 3)
         tab.wait(lambda t: t.value("Curve") == "ellipse")
+        tab.settle()                                      # all that was done so far has had its effect, seen here
+
+What an action brings about comes later, on a slow machine much later: wait for the state itself, or, for what must
+*not* come about, `settle` first. A long timeout costs nothing when all goes well.
 
 What the page would show is mirrored and may be read at any time:
 
     text()  html()             all visible panel text without / with its tags
-    element(label)             `Element`: type, value, props, visible, enabled; waits up to 5 s for it to appear
+    element(label)             `Element`: type, value, props; waits for it to appear
     elements  labels()         every element by uuid; labels of the visible ones
     value(label)  props(label)
     scene                      {name: SceneNode(type, props, visible)}, numpy arrays decoded (``props["points"]``)
@@ -34,6 +38,7 @@ What the page would show is mirrored and may be read at any time:
 
 from __future__ import annotations
 
+import functools
 import html as html_module
 import http.client
 import itertools
@@ -41,6 +46,7 @@ import re
 import threading
 import time
 import uuid
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -51,19 +57,55 @@ import numpy as np
 import viser
 import viser.transforms
 import zstandard
+from viser import _messages as wire
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from dbh_studio.ui.bind import TabWorker
+from dbh_studio.ui.messages import MessageGate
+
 BRIDGE_LABEL = "dbh-bridge"
 PART_BYTES = 512 * 1024
+PATIENCE_S = 120.0
 _NO_DOUBLE_CLICK_S = 0.45
+_MARK = "// so far "
 _serials = itertools.count(1)
+
+
+def _remembered(kind: type) -> list[weakref.ref[Any]]:
+    """All objects of a class that are made from now on: a tab finds its server, and what works for it there."""
+    made: list[weakref.ref[Any]] = []
+    init = kind.__init__  # type: ignore[misc]
+
+    @functools.wraps(init)
+    def remembering(self: Any, *args: Any, **options: Any) -> None:
+        init(self, *args, **options)
+        made.append(weakref.ref(self))
+
+    kind.__init__ = remembering  # type: ignore[misc]
+    return made
+
+
+def _living(made: list[weakref.ref[Any]]) -> list[Any]:
+    return [thing for thing in (reference() for reference in list(made)) if thing is not None]
+
+
+_gates, _workers = _remembered(MessageGate), _remembered(TabWorker)
+
+
+def until_ended(*names: str) -> None:
+    """Wait until no thread has one of these names."""
+    deadline = time.monotonic() + PATIENCE_S
+    # Not `join`: one that is just being started cannot be joined.
+    while any(thread.name in names for thread in threading.enumerate()):
+        assert time.monotonic() < deadline, f"one of {names} goes on and on"
+        time.sleep(0.005)
 
 
 def http_get(url: str, headers: dict[str, str] | None = None) -> tuple[int, dict[str, str], bytes]:
     """One GET without following redirects: (status, headers by lower-case name, body). `headers` may replace Host."""
     parts = urlsplit(url)
-    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=10)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=PATIENCE_S)
     try:
         connection.request(
             "GET", (parts.path or "/") + (f"?{parts.query}" if parts.query else ""), headers=headers or {}
@@ -152,6 +194,7 @@ class FakeClient:
     ) -> None:
         parts = urlsplit(url)
         self.fov_rad, self.size = fov_rad, size
+        self._port = parts.port
         cookie = login(url) if cookie is None else cookie
         all_headers = {**({"Cookie": cookie} if cookie else {}), **(headers or {})}
         self.elements: dict[str, Element] = {}
@@ -166,6 +209,8 @@ class FakeClient:
         self._shown: dict[str, Notification] = {}
         self._downloading: dict[str, _Download] = {}
         self._n_bridge = 0
+        self._handle: viser.ClientHandle | None = None
+        self._marks: set[str] = set()
         self._far = 1000.0 + next(_serials)  # tells this tab from the others, see `handle`
         self._changed = threading.Condition()
         self._socket = connect(
@@ -175,6 +220,7 @@ class FakeClient:
             compression=None,
             origin=origin or f"http://{parts.netloc}",  # type: ignore[arg-type]
             additional_headers=all_headers,
+            open_timeout=PATIENCE_S,
         )
         self._receiver = threading.Thread(target=self._receive, daemon=True)
         self._receiver.start()
@@ -190,7 +236,7 @@ class FakeClient:
     def close(self) -> None:
         """Close the tab."""
         self._socket.close()
-        self._receiver.join(5)
+        self._receiver.join(PATIENCE_S)
 
     # -- the wire ---------------------------------------------------------------------------------------------------
 
@@ -218,8 +264,11 @@ class FakeClient:
                 self._changed.notify_all()
 
     def _apply(self, message: dict[str, Any]) -> None:
-        self.messages.append(message)
         kind = message["type"]
+        if kind == "RunJavascriptMessage" and message["source"].startswith(_MARK):
+            self._marks.add(message["source"])
+            return
+        self.messages.append(message)
         handler = getattr(self, f"_apply_{kind}", None)
         if handler is not None:
             handler(message)
@@ -320,7 +369,7 @@ class FakeClient:
 
     # -- waiting ----------------------------------------------------------------------------------------------------
 
-    def wait(self, condition: Callable[[FakeClient], Any], timeout: float = 5.0) -> FakeClient:
+    def wait(self, condition: Callable[[FakeClient], Any], timeout: float = PATIENCE_S) -> FakeClient:
         """Block until `condition(self)` is true. Raises TimeoutError with what the panel held."""
         deadline = time.monotonic() + timeout
         with self._changed:
@@ -332,11 +381,11 @@ class FakeClient:
                 self._changed.wait(min(left, 0.05))  # conditions may read what does not arrive here
         return self
 
-    def wait_text(self, text: str, timeout: float = 5.0) -> FakeClient:
+    def wait_text(self, text: str, timeout: float = PATIENCE_S) -> FakeClient:
         """Block until the visible panel text contains `text`."""
         return self.wait(lambda t: text in t.text(), timeout)
 
-    def wait_notification(self, text: str, timeout: float = 5.0) -> Notification:
+    def wait_notification(self, text: str, timeout: float = PATIENCE_S) -> Notification:
         """Block until a notification's title or body contains `text`, and return it."""
         self.wait(lambda t: t._notification(text) is not None, timeout)
         found = self._notification(text)
@@ -346,13 +395,65 @@ class FakeClient:
     def _notification(self, text: str) -> Notification | None:
         return next((n for n in self.notifications if text in n.title or text in n.body), None)
 
-    def settle(self, quiet_s: float = 0.15) -> FakeClient:
-        """Block until nothing has arrived for `quiet_s`: for "nothing happens" checks; otherwise use `wait`."""
-        count = -1
-        while count != len(self.messages):
-            count = len(self.messages)
-            time.sleep(quiet_s)
+    def delivered(self) -> FakeClient:
+        """Block until the server has taken all that was sent, in its order, and put it into the tab's queue."""
+        handle = self._own_handle()
+        if handle is not None:
+            uuid_, taken = uuid.uuid4().hex, threading.Event()
+
+            def note(_: int, message: wire.LocalStorageGetItemResponseMessage) -> None:
+                if message.request_uuid == uuid_:
+                    taken.set()
+
+            kind = wire.LocalStorageGetItemResponseMessage  # it does nothing but come behind everything else
+            handle._websock_connection.register_handler(kind, note)
+            try:
+                self.send(type=kind.__name__, request_uuid=uuid_, value=None, error=None)
+                self.wait(lambda t: taken.is_set() or t.closed)
+            finally:
+                handle._websock_connection.unregister_handler(kind, note)
         return self
+
+    def settle(self, quiet_s: float = 0.1) -> FakeClient:
+        """Block until nothing goes on any more between page and server, and then for `quiet_s`.
+
+        All that was sent has been taken, no plot is being opened, the tab's queue is empty, no cloud is being sent, and
+        all that came of it has arrived here. A job in a child process is no part of it: see `Studio.wait_idle`.
+        """
+        n_messages = -1
+        while n_messages != len(self.messages) and not self.closed:
+            n_messages = len(self.messages)
+            self._caught_up()
+            time.sleep(quiet_s)
+            self._caught_up()
+        return self
+
+    def _caught_up(self) -> None:
+        self.delivered()
+        handle = self._own_handle()
+        if handle is None or self.closed:
+            return
+        until_ended("open", "at once")
+        for worker in _living(_workers):
+            if worker.client is handle:
+                assert worker.join(PATIENCE_S), "the tab's queue stands still; `delivered` is what to wait for"
+        until_ended("stream")
+        mark = f"{_MARK}{uuid.uuid4().hex}"
+        handle._websock_connection.queue_message(wire.RunJavascriptMessage(source=mark))
+        handle.flush()
+        self.wait(lambda t: mark in t._marks or t.closed)
+
+    def _own_handle(self) -> viser.ClientHandle | None:
+        """The server's handle of this tab; None where the server is in another process, or has lost the tab."""
+        if self._handle is None and any(gate._server.get_port() == self._port for gate in _living(_gates)):
+
+            def found() -> bool:
+                clients = [c for gate in _living(_gates) for c in gate._server.get_clients().values()]
+                self._handle = next((client for client in clients if client.camera.far == self._far), None)
+                return self._handle is not None or self.closed
+
+            self.wait(lambda _: found())
+        return self._handle
 
     def handle(self, server: viser.ViserServer) -> viser.ClientHandle:
         """The server's handle of this tab, once the server has seen its camera."""
@@ -369,12 +470,13 @@ class FakeClient:
 
     def visible(self, element: Element) -> bool:
         """Whether the element and all folders, tabs and panels around it are shown."""
-        while element.props.get("visible", True):
-            parent = self._container(element.container)
-            if parent is None:
-                return True
-            element = parent
-        return False
+        with self._changed:
+            while element.props.get("visible", True):
+                parent = self._container(element.container)
+                if parent is None:
+                    return True
+                element = parent
+            return False
 
     def _container(self, container: str) -> Element | None:
         if container in self.elements:
@@ -385,10 +487,11 @@ class FakeClient:
         return None
 
     def _find(self, label: str, *, force: bool = False) -> Element | None:
-        found = [e for e in list(self.elements.values()) if e.label == label]
-        return next((e for e in found if self.visible(e)), found[0] if found and force else None)
+        with self._changed:
+            found = [e for e in self.elements.values() if e.label == label]
+            return next((e for e in found if self.visible(e)), found[0] if found and force else None)
 
-    def element(self, label: str, *, force: bool = False, timeout: float = 5.0) -> Element:
+    def element(self, label: str, *, force: bool = False, timeout: float = PATIENCE_S) -> Element:
         """The visible element with this label; with `force` also a hidden one. Raises KeyError with all labels."""
         try:
             self.wait(lambda t: t._find(label, force=force) is not None, timeout)
@@ -400,7 +503,8 @@ class FakeClient:
 
     def labels(self) -> list[str]:
         """Labels of all visible elements."""
-        return [e.label for e in list(self.elements.values()) if e.label and self.visible(e)]
+        with self._changed:
+            return [e.label for e in self.elements.values() if e.label and self.visible(e)]
 
     def has(self, label: str) -> bool:
         """Whether a visible element has this label now."""
@@ -419,34 +523,57 @@ class FakeClient:
         return self.element(label).props
 
     def press(self, label: str, *, force: bool = False, hurried: bool = False) -> None:
-        """Press a button; the same one again after so long that it is no double click, unless `hurried` or forced."""
-        element = self.element(label, force=force)
-        wait_s = self._pressed_at.get(element.uuid, 0.0) + _NO_DOUBLE_CLICK_S - time.monotonic()
-        if wait_s > 0 and not (force or hurried):
-            time.sleep(wait_s)
+        """Press a button as soon as it can be pressed.
+
+        The same one again when the first press has been dealt with, and so long after it that it is no double click,
+        unless `hurried` or forced.
+        """
+        element = self._usable(label, force)
+        if element.uuid in self._pressed_at and not (force or hurried):
+            self._caught_up()
+            time.sleep(max(0.0, self._pressed_at[element.uuid] + _NO_DOUBLE_CLICK_S - time.monotonic()))
+            element = self._usable(label, force)
+        self._update(element, True)
+        if not hurried:
+            self.delivered()  # the server has the time of the press by its own clock, not later than this
         self._pressed_at[element.uuid] = time.monotonic()
-        self._update(element, True, force)
 
-    def set(self, label: str, value: Any, *, force: bool = False) -> None:
-        """Change an input; the page shows the new value at once, as a browser does."""
+    def set(self, label: str, value: Any, *, force: bool = False, hurried: bool = False) -> None:
+        """Change an input; the page shows the new value at once, as a browser does.
+
+        The server has it when this returns, unless `hurried`.
+        """
+        element = self._usable(label, force)
+        element.value = value  # before it is sent: the server may answer with another one
+        self._update(element, value)
+        if not hurried:
+            self.delivered()
+
+    def _usable(self, label: str, force: bool) -> Element:
         element = self.element(label, force=force)
-        self._update(element, value, force)
-        element.value = value
+        if not force:
+            try:
+                self.wait(lambda t: (e := t._find(label)) is not None and not e.props.get("disabled", False))
+            except TimeoutError:
+                raise AssertionError(f"{label!r} is disabled or has gone") from None
+            element = self.element(label)
+        return element
 
-    def _update(self, element: Element, value: Any, force: bool) -> None:
-        assert force or not element.props.get("disabled", False), f"{element.label!r} is disabled"
+    def _update(self, element: Element, value: Any) -> None:
         self.send(type="GuiUpdateMessage", uuid=element.uuid, updates={"value": value})
 
     def command(self, label: str) -> None:
         """Trigger a command, as its hotkey or the palette does."""
         self.wait(lambda t: any(p["label"] == label for p in t._commands.values()))
-        key, props = next((k, p) for k, p in self._commands.items() if p["label"] == label)
+        with self._changed:
+            key, props = next((k, p) for k, p in self._commands.items() if p["label"] == label)
         assert not props["disabled"], f"command {label!r} is disabled"
         self.send(type="CommandTriggerMessage", uuid=key)
 
     def commands(self) -> dict[str, tuple[str | None, str | None]]:
         """Label of every command with its hotkey and modifier."""
-        return {p["label"]: (p["hotkey"], p["modifier"]) for p in self._commands.values()}
+        with self._changed:
+            return {p["label"]: (p["hotkey"], p["modifier"]) for p in self._commands.values()}
 
     def upload(self, label: str, name: str, content: bytes, *, mime: str = "application/octet-stream") -> str:
         """Send a file through an upload button; returns the transfer's id. Does not wait for the server."""

@@ -11,13 +11,11 @@ import numpy as np
 
 from dbh_studio.app.commands import replace_trunks
 from dbh_studio.app.opening import open_plot
-from dbh_studio.app.pipeline import segment_plot
+from dbh_studio.app.pipeline import Segmentation, segment_plot
 from dbh_studio.app.session import Session
 from dbh_studio.core.cloud import PointCloud
-from dbh_studio.core.ground import GroundModel
 from dbh_studio.core.progress import Progress
 from dbh_studio.core.synthetic import PlotRecipe, SyntheticPlot, make_plot
-from dbh_studio.core.trunks import TrunkSet
 from dbh_studio.io.las import write_las
 from dbh_studio.io.ply import write_ply
 from dbh_studio.settings import Settings
@@ -38,16 +36,16 @@ def write_laz(folder: Path, name: str = "plot.laz") -> Path:
 
 
 @functools.cache
-def _found() -> tuple[GroundModel, TrunkSet, tuple[str, ...]]:
+def _found() -> Segmentation:
     return segment_plot(plot().cloud.xyz, Settings())
 
 
 def measured_session(folder: Path) -> Session:
     """The plot opened from a file, with its trunks found and measured; the work is done once per run of the tests."""
     session = open_plot(write_laz(folder), project_dir=folder / "plot.dbh")
-    ground, trunks, _ = _found()
-    session.remember_ground(session.document, ground)
-    session.do(replace_trunks(trunks))
+    found = _found()
+    session.remember_ground(session.document, found.ground)
+    session.do(replace_trunks(found.trunks))
     document = session.document
     if not _measurements:
         _measurements.extend(session.measurements())
@@ -68,8 +66,8 @@ def write_unscaled_ply(folder: Path, *, metres_per_unit: float = 1.7) -> Path:
 
 
 def true_diameters_cm() -> np.ndarray:
-    """Perimeter / π of the plot's stems in the middle of the measured band, ascending."""
-    return np.sort([tree.diameter_cm("curve", height_m=1.37) for tree in plot().trees])
+    """What a tape reads at breast height on the plot's stems, ascending."""
+    return np.sort([tree.diameter_cm("tape", height_m=1.30) for tree in plot().trees])
 
 
 def endless_search(points_world: Any, settings: Settings, existing_ids: Any = None, *, progress: Progress) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 import viser
 from fakeclient import FakeClient
+from panel import LONG
 
 from dbh_studio.errors import CancelledError, MalformedFileError, StudioError
 from dbh_studio.ui.bind import SceneClick, SceneRectangle, TabWorker, for_each_tab
@@ -24,14 +26,14 @@ class Gate:
 
     def __call__(self, *_: Any) -> None:
         self.started.set()
-        assert self.release.wait(10)
+        assert self.release.wait(LONG)
 
 
 def test_work_runs_in_order_on_one_thread(worker: TabWorker) -> None:
     seen: list[tuple[int, str]] = []
     for i in range(200):
         assert worker.post(lambda i=i: seen.append((i, threading.current_thread().name)))
-    assert worker.join(5)
+    assert worker.join(LONG)
     assert [i for i, _ in seen] == list(range(200))
     assert len({name for _, name in seen}) == 1 and seen[0][1] != threading.current_thread().name
 
@@ -57,8 +59,8 @@ def test_each_value_is_the_one_of_its_event(worker: TabWorker, tab: FakeClient) 
     worker.on_update(worker.client.gui.add_slider("Height", 0, 100, 1, 0), seen.append)
     worker.post(gate)
     for value in range(1, 31):
-        tab.set("Height", value)
-    tab.settle(0.05)
+        tab.set("Height", value, hurried=True)
+    tab.delivered()
     gate.release.set()
     tab.wait(lambda _: len(seen) == 30)
     assert seen == list(range(1, 31))
@@ -76,9 +78,9 @@ def test_a_drag_leaves_only_its_latest_value(worker: TabWorker, tab: FakeClient)
     tab.press("Measure")
     for value in (4, 5, 6):
         tab.set("Height", value)
-    tab.wait(lambda _: slider.value == 6)
+    assert slider.value == 6
     gate.release.set()
-    tab.wait(lambda _: len(seen) == 3)
+    tab.settle()
     assert seen == [3, "measure", 6]  # the press still sees the value that was set before it
 
 
@@ -90,23 +92,27 @@ def test_two_streams_of_latest_values_do_not_push_each_other_along(worker: TabWo
         worker.post_latest("a", lambda i: seen.append(("a", i)), i)
         worker.post_latest("b", lambda i: seen.append(("b", i)), i)
     gate.release.set()
-    assert worker.join(5)
+    assert worker.join(LONG)
     assert seen == [("a", 4), ("b", 4)]
 
 
-def test_a_double_click_acts_once(worker: TabWorker, tab: FakeClient) -> None:
+def test_a_press_while_the_first_is_dealt_with_does_nothing(
+    worker: TabWorker, tab: FakeClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dbh_studio.ui.bind._DOUBLE_CLICK_S", 0.0)  # however long it comes after it
     gate, runs = Gate(), []
     worker.on_click(worker.client.gui.add_button("Segment"), lambda: (runs.append(1), gate()))
     other: list[int] = []
     worker.on_click(worker.client.gui.add_button("Other"), lambda: other.append(1))
     tab.press("Segment")
-    assert gate.started.wait(5)
-    tab.press("Segment")
-    tab.press("Segment")
+    assert gate.started.wait(LONG)
+    tab.press("Segment", hurried=True)
+    tab.press("Segment", hurried=True)
     tab.press("Other")
     tab.wait(lambda _: len(worker._queue) == 1)
     gate.release.set()
     tab.wait(lambda _: other == [1])
+    tab.settle()
     assert len(runs) == 1
     tab.press("Segment")  # and works again afterwards, also after a failure
     tab.wait(lambda _: len(runs) == 2)
@@ -122,7 +128,7 @@ def test_a_button_works_again_after_its_handler_failed(worker: TabWorker, tab: F
     worker.on_click(worker.client.gui.add_button("Measure"), fail)
     tab.press("Measure")
     tab.wait_notification("No trunk is selected.")
-    assert worker.join(5)
+    assert worker.join(LONG)
     tab.press("Measure")
     tab.wait(lambda _: len(runs) == 2)
 
@@ -131,9 +137,9 @@ def test_cancel_does_not_wait_in_the_queue(worker: TabWorker, tab: FakeClient) -
     gate = Gate()
     worker.on_click(worker.client.gui.add_button("Run"), gate)
     tab.press("Run")
-    assert gate.started.wait(5)
+    assert gate.started.wait(LONG)
     worker.run_at_once(gate.release.set)
-    assert gate.release.wait(5)
+    assert gate.release.wait(LONG)
 
 
 def test_changes_by_the_program_are_not_events(worker: TabWorker, tab: FakeClient) -> None:
@@ -143,7 +149,7 @@ def test_changes_by_the_program_are_not_events(worker: TabWorker, tab: FakeClien
     box.value = True
     tab.wait(lambda t: t.value("Labels") is True)
     tab.set("Labels", False)
-    tab.wait(lambda _: len(seen) > 0)
+    tab.settle()
     assert seen == [False]
 
 
@@ -159,6 +165,7 @@ def test_a_shared_element_tells_only_the_tab_that_used_it(
         other.on_click(shared, lambda: theirs.append(1))
         second.press("Shared")
         second.wait(lambda _: theirs == [1])
+        tab.settle()
         assert mine == []
         other.close()
     shared.remove()
@@ -172,6 +179,21 @@ def test_button_groups_and_texts(worker: TabWorker, tab: FakeClient) -> None:
     tab.set("Species", "beech")
     tab.wait(lambda _: len(seen) == 2)
     assert seen == ["far", "beech"]
+
+
+def test_the_fake_page_settles_when_all_it_set_off_has_arrived(worker: TabWorker, tab: FakeClient) -> None:
+    gate = Gate()
+
+    def slowly() -> None:
+        gate()
+        worker.notify("one")
+        worker.post(lambda: (time.sleep(0.5), worker.notify("two")))
+
+    worker.on_click(worker.client.gui.add_button("Go"), slowly)
+    tab.press("Go")
+    assert not tab.delivered().notifications
+    gate.release.set()
+    assert [note.title for note in tab.settle().notifications] == ["one", "two"]
 
 
 # -- gestures -------------------------------------------------------------------------------------------------------
@@ -245,7 +267,7 @@ def test_an_unexpected_error_is_logged_and_not_spelled_out(
     assert "KeyError: 'secret'" in caplog.text
     done = threading.Event()
     worker.post(done.set)
-    assert done.wait(5)  # the tab goes on
+    assert done.wait(LONG)  # the tab goes on
 
 
 def test_cancelled_work_is_not_an_error(worker: TabWorker, tab: FakeClient) -> None:
@@ -275,21 +297,21 @@ def test_after_close_nothing_runs_and_nothing_listens(worker: TabWorker, tab: Fa
     worker.on_scene_click(worker.client, lambda _: seen.append("click"))
     worker.on_close(lambda: seen.append("closed"))
     worker.post(gate)
-    assert gate.started.wait(5)
+    assert gate.started.wait(LONG)
     worker.post(seen.append, "queued")
     worker.close()
     worker.close()
     gate.release.set()
-    assert worker.closed and worker.join(5) and not worker.post(seen.append, "late")
+    assert worker.closed and worker.join(LONG) and not worker.post(seen.append, "late")
     assert not button._impl.update_cb and not box._impl.update_cb and not command._impl.trigger_cb
     assert not worker.client.scene._scene_pointer_cb
     worker.on_close(lambda: seen.append("closed late"))
     worker.run_at_once(seen.append, "too late")
     worker.notify("never shown")
-    worker._thread.join(5)
+    worker._thread.join(LONG)
     assert not worker._thread.is_alive()
     assert seen == ["closed", "closed late"]
-    assert not any("never shown" in note.title for note in tab.settle(0.05).notifications)
+    assert not any("never shown" in note.title for note in tab.settle().notifications)
 
 
 def test_a_listener_that_fails_to_leave_does_not_keep_the_others(
@@ -315,6 +337,7 @@ def test_every_tab_gets_a_worker_and_loses_it(server: StudioServer) -> None:
         with FakeClient(own.url) as first, FakeClient(own.url) as second:
             first.wait_text("tab")
             second.wait_text("tab")
+            first.wait(lambda _: len(workers) == 2)
             assert len(workers) == 2 and not any(w.closed for w in workers)
             first.close()
             second.wait(lambda _: sum(w.closed for w in workers) == 1)
@@ -330,12 +353,12 @@ def test_work_that_outlives_its_tab_is_harmless(server: StudioServer, caplog: py
         text = worker.client.gui.add_markdown("before")
         gate = Gate()
         worker.post(lambda: (gate(), setattr(text, "content", "after"), worker.notify("done")))
-        assert gate.started.wait(5)
+        assert gate.started.wait(LONG)
     client_id = worker.client.client_id
     tab.wait(lambda _: client_id not in server.viser.get_clients())
     worker.close()
     gate.release.set()
-    worker._thread.join(5)
+    worker._thread.join(LONG)
     assert not worker._thread.is_alive() and not caplog.records
 
 
@@ -345,10 +368,10 @@ def test_a_flood_is_cut_off(
     monkeypatch.setattr("dbh_studio.ui.bind._MAX_QUEUED", 5)
     gate, seen = Gate(), []
     worker.post(gate)
-    assert gate.started.wait(5)
+    assert gate.started.wait(LONG)
     accepted = [worker.post(seen.append, i) for i in range(8)]
     gate.release.set()
-    assert worker.join(5) and accepted == [True] * 5 + [False] * 3 and seen == list(range(5))
+    assert worker.join(LONG) and accepted == [True] * 5 + [False] * 3 and seen == list(range(5))
     assert "too far behind" in caplog.text
 
 

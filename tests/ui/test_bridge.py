@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from fakeclient import BRIDGE_LABEL, FakeClient
+from panel import LONG
 
 from dbh_studio.ui import bridge as bridge_module
 from dbh_studio.ui.bind import TabWorker
@@ -50,11 +51,11 @@ def test_messages_wait_their_turn_in_the_tab(bridge: Bridge, tab: FakeClient) ->
     seen: list[str] = []
     go = threading.Event()
     worker = bridge._worker
-    worker.on_click(worker.client.gui.add_button("First"), lambda: (go.wait(5), seen.append("first")))
+    worker.on_click(worker.client.gui.add_button("First"), lambda: (go.wait(LONG), seen.append("first")))
     bridge.on("row", lambda _: seen.append("second"))
     tab.press("First")
     tab.bridge_send("row", 1)
-    tab.settle(0.05)
+    tab.delivered()
     go.set()
     tab.wait(lambda _: seen == ["first", "second"])
 
@@ -63,13 +64,13 @@ def test_strokes_may_be_thinned_to_the_latest(bridge: Bridge, tab: FakeClient) -
     seen: list[int] = []
     go, started = threading.Event(), threading.Event()
     bridge.on("stroke", seen.append, coalesce=True)
-    bridge._worker.post(lambda: (started.set(), go.wait(5)))
-    assert started.wait(5)
+    bridge._worker.post(lambda: (started.set(), go.wait(LONG)))
+    assert started.wait(LONG)
     for i in range(20):
         tab.bridge_send("stroke", i)
-    tab.settle(0.05)
+    tab.delivered()
     go.set()
-    tab.wait(lambda _: len(seen) > 0)
+    tab.settle()
     assert seen == [19]
 
 
@@ -99,7 +100,7 @@ def test_malformed_messages_reach_nobody(bridge: Bridge, tab: FakeClient, text: 
     bridge.on("row", seen.append)
     send_text(tab, text)
     tab.bridge_send("row", "good")
-    tab.wait(lambda _: len(seen) > 0)
+    tab.settle()
     assert seen == ["good"] and not tab.notifications
 
 

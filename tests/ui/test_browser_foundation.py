@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import browser
@@ -51,7 +52,7 @@ class Studio:
 
     def wait(self, kind: str) -> Any:
         with self.arrived:
-            assert self.arrived.wait_for(lambda: any(k == kind for k, _ in self.seen), 20), f"{kind} never came"
+            assert self.arrived.wait_for(lambda: any(k == kind for k, _ in self.seen), 120), f"{kind} never came"
             return next(value for k, value in self.seen if k == kind)
 
     def open_tab(self, worker: TabWorker) -> None:
@@ -74,6 +75,14 @@ def studio() -> Iterator[Studio]:
     made = Studio()
     yield made
     made.server.stop()
+
+
+def until(page: Any, condition: Callable[[], bool]) -> None:
+    """Ask again and again; the page's own events come in between."""
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline, "did not come to pass"
+        page.wait_for_timeout(50)
 
 
 def test_the_page_works_behind_the_guard(studio: Studio, chromium: Any) -> None:
@@ -122,9 +131,9 @@ def test_the_page_works_behind_the_guard(studio: Studio, chromium: Any) -> None:
     # A foreign address is not reachable from the page.
     blocked = "() => fetch('http://192.0.2.1/').then(() => 'sent', e => String(e))"
     assert "sent" not in page.evaluate(blocked)
+    until(page, lambda: any(re.search("Content Security Policy", error) for error in browser.page_errors(page)))
     errors = [error for error in browser.page_errors(page) if "192.0.2.1" not in error]
     assert errors == []
-    assert any(re.search("Content Security Policy", error) for error in browser.page_errors(page))
 
     # A dropped connection comes back as a new tab with a new bridge.
     studio.seen.clear()
@@ -133,5 +142,5 @@ def test_the_page_works_behind_the_guard(studio: Studio, chromium: Any) -> None:
     page.wait_for_selector("tr.row")
     page.evaluate("() => window.dbh('script', 'again')")
     assert studio.wait("script") == "again"
-    assert [tab.closed for tab in studio.tabs] == [True, False]
+    until(page, lambda: [tab.closed for tab in studio.tabs] == [True, False])
     page.context.close()

@@ -22,7 +22,7 @@ from dbh_studio.ui.studio import Studio
 pytestmark = pytest.mark.browser
 
 LAPTOP = (1280, 720)
-LONG_S = 60.0
+LONG_S = 120.0
 VIEW = "#dbh-photo .view"
 
 
@@ -52,6 +52,7 @@ def settled(page: Any, studio: Studio) -> np.ndarray:
     assert studio.wait_idle(LONG_S)
     seen = -1
     while seen != frame(page):
+        browser.settle(page, studio)
         seen = frame(page)
         page.wait_for_timeout(400)
     shot = page.screenshot(clip=page.locator(VIEW).bounding_box())
@@ -93,10 +94,12 @@ def test_from_a_camera_in_the_scene_to_a_pixel_of_its_photo(chromium: Any, studi
     camera = tab.client.camera
     camera.position = centre + np.array([0.6, 0.6, 1.5])
     camera.look_at = centre
+    browser.settle(page, studio)
     until(lambda: abs(browser.pixel_of(page, centre)[1] - LAPTOP[1] / 2) < 3)
     page.wait_for_function("() => window.__viserTestpoints.rendererInfo.render.triangles > 0")
     page.mouse.click(*browser.pixel_of(page, centre))
     page.wait_for_selector(f"{VIEW}[data-frame]")
+    browser.settle(page, studio)
     assert tab.photos.image == photo_plots.name(2)
     page.get_by_text(photo_plots.name(2)).first.wait_for()
     until(lambda: np.linalg.norm(np.asarray(camera.position) - centre) < 1e-3)
@@ -137,6 +140,6 @@ def test_from_a_camera_in_the_scene_to_a_pixel_of_its_photo(chromium: Any, studi
     settled(page, studio)
     page.click("#dbh-photo [data-photo=close]")
     page.wait_for_selector("#dbh-photo", state="detached")
-    assert tab.photos.image is None
+    until(lambda: tab.photos.image is None)
     assert browser.page_errors(page) == []
     page.context.close()

@@ -19,7 +19,7 @@ from dbh_studio.ui.studio import Studio
 pytestmark = pytest.mark.browser
 
 LAPTOP = (1280, 720)
-LONG_S = 60.0
+LONG_S = 120.0
 _PHOTO_PIXEL = """() => {
   const box = document.querySelector('#dbh-photo .view').getBoundingClientRect();
   return [box.x, box.y, box.width, box.height];
@@ -51,8 +51,10 @@ def session(studio: Studio, shared_page: Any, tmp_path: Path) -> Iterator[Sessio
     shared_page.click("button[data-step=scale]")
     shared_page.wait_for_selector(".dbh-ways")
     assert studio.display is not None
+    browser.settle(shared_page, studio)
     browser.wait_for_points(shared_page, int((~studio.display.is_crown).sum()))
     yield opened
+    browser.settle(shared_page, studio)
     errors = browser.page_errors(shared_page)
     shared_page.studio_errors.clear()
     assert errors == []
@@ -72,12 +74,13 @@ def tab_of(studio: Studio) -> Any:
     return tab
 
 
-def look_at(studio: Studio, target: np.ndarray, away: np.ndarray) -> None:
+def look_at(page: Any, studio: Studio, target: np.ndarray, away: np.ndarray) -> None:
     """Put the camera where a person would fly to."""
     tab = tab_of(studio)
     tab.worker.post(lambda: tab.scene._move(target + away, target, animate=False))
+    browser.settle(page, studio)
     until(lambda: np.linalg.norm(np.asarray(tab.client.camera.position) - target - away) < 1e-3)
-    time.sleep(0.5)  # the page draws it
+    browser.settle(page, studio)
 
 
 def test_four_corners_of_a_marker_clicked_in_the_cloud(studio: Studio, session: Session, shared_page: Any) -> None:
@@ -87,7 +90,7 @@ def test_four_corners_of_a_marker_clicked_in_the_cloud(studio: Studio, session: 
     page.click("button[data-way=cloud]")
     page.click("button[data-start=square]")
     page.wait_for_selector("#dbh-banner")
-    look_at(studio, corners.mean(axis=0), side * np.array([0.1, -1.0, 2.0]))
+    look_at(page, studio, corners.mean(axis=0), side * np.array([0.1, -1.0, 2.0]))
     for number, corner in enumerate(corners):
         page.mouse.click(*browser.pixel_of(page, corner))
         page.wait_for_selector(f"button[data-point='{number}'][data-kind=done]")
@@ -112,9 +115,10 @@ def test_the_enlarged_point_is_moved_by_a_click_and_by_the_arrow_keys(
     page, corner = shared_page, scale_plots.plot().corners()[0]
     page.click("button[data-way=cloud]")
     page.click("button[data-start=bar]")
-    look_at(studio, corner, np.array([0.2, -1.5, 2.5]))
+    look_at(page, studio, corner, np.array([0.2, -1.5, 2.5]))
     page.mouse.click(*browser.pixel_of(page, corner + [0.03, 0.0, 0.0]))
     page.wait_for_selector(".dbh-closeup")
+    browser.settle(page, studio)
     marking = tab_of(studio).marking
     eye = np.asarray(tab_of(studio).client.camera.position)
     # Where the corner is in the picture as it is enlarged.
@@ -127,7 +131,7 @@ def test_the_enlarged_point_is_moved_by_a_click_and_by_the_arrow_keys(
     until(lambda: not np.array_equal(marking.picks.picks[0].point.xyz_src, before))
     step = np.linalg.norm(np.array(marking.picks.picks[0].point.xyz_src) - before)
     assert 0 < step < 3 * 2 * marking.close_up.half_width / 260
-    time.sleep(0.3)
+    browser.settle(page, studio)
     np.testing.assert_allclose(tab_of(studio).client.camera.position, eye, atol=1e-6)  # the keys did not fly
     page.keyboard.press("Escape")
     page.wait_for_selector("#dbh-banner", state="detached")
@@ -148,12 +152,13 @@ def test_the_chosen_point_is_dragged_by_its_arrows(studio: Studio, session: Sess
     page, corner = shared_page, scale_plots.plot().corners()[0]
     page.click("button[data-way=cloud]")
     page.click("button[data-start=bar]")
-    look_at(studio, corner, np.array([0.2, -1.5, 2.5]))
+    look_at(page, studio, corner, np.array([0.2, -1.5, 2.5]))
     page.mouse.click(*browser.pixel_of(page, corner))
     page.wait_for_selector("button[data-point='0'][data-kind=done]")
     marking, camera = tab_of(studio).marking, tab_of(studio).client.camera
     before, eye = np.array(marking.picks.picks[0].point.xyz_src), np.asarray(camera.position)
-    time.sleep(1.0)  # the page draws the arrows
+    browser.settle(page, studio)
+    time.sleep(0.5)  # the page draws the arrows
     reach = 0.08 * float(np.linalg.norm(eye - before))
     start = browser.pixel_of(page, before + [0.7 * reach, 0.0, 0.0])
     end = browser.pixel_of(page, before + [1.7 * reach, 0.0, 0.0])
@@ -186,11 +191,11 @@ def test_a_bar_clicked_in_two_panoramas(studio: Studio, session: Session, shared
         if number == 0:
             page.click("button[data-do=photo]")
         until(lambda: tab.photos.image is not None)
-        click_in_photo(page, tab, end)
+        click_in_photo(page, studio, tab, end)
         page.locator(".dbh-offers button").first.click()
         used = tab.marking.picks.current.sights[0].image
         until(lambda used=used: tab.photos.image != used)
-        click_in_photo(page, tab, end)
+        click_in_photo(page, studio, tab, end)
         page.wait_for_selector(f"button[data-point='{number}'][data-kind=done]")
         found = np.array(tab.marking.picks.picks[number].point.xyz_src)
         assert np.linalg.norm(found - end) * truth.metres_per_unit < 0.02
@@ -207,14 +212,15 @@ def test_a_bar_clicked_in_two_panoramas(studio: Studio, session: Session, shared
     assert not session.document.scale.is_known
 
 
-def click_in_photo(page: Any, tab: Any, point: np.ndarray) -> None:
+def click_in_photo(page: Any, studio: Studio, tab: Any, point: np.ndarray) -> None:
     """Look at where a point is in the open photo, as a person who sees it would, and click it."""
     name = tab.photos.image
     u, v = scale_plots.plot().posed.by_name(name).project(point[None])[0][0]
     tab.worker.post(lambda: tab.photos.open(name, at_px=(float(u), float(v)), zoom_px=4.0))
     look = until(lambda: drawn_look(tab, (float(u), float(v))))
-    page.wait_for_selector("#dbh-photo .view")
-    time.sleep(0.8)  # the page shows the newest picture
+    page.wait_for_selector("#dbh-photo .view[data-frame]")
+    browser.settle(page, studio)
+    time.sleep(0.4)  # the page shows the newest picture
     (x, y), _ = (np.asarray(part)[0] for part in look.view_from_photo([[u, v]]))
     left, top, width, height = page.evaluate(_PHOTO_PIXEL)
     n_sights = len(tab.marking.picks.current.sights)

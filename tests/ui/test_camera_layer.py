@@ -5,7 +5,7 @@ import photo_plots
 import plots
 import pytest
 from fakeclient import FakeClient
-from panel import LONG
+from panel import LONG, idle
 
 from dbh_studio.app import commands
 from dbh_studio.app.cameras import Cameras, cloud_sample, read_cameras
@@ -116,7 +116,7 @@ def test_the_photos_follow_scale_and_undo_and_can_be_hidden(shown, studio):
     turned = studio.session.document.world_from_source.apply(expected)
     shown.wait(lambda t: "/cameras/globes" in t.scene and np.allclose(places(t), turned, atol=1e-3), LONG)
     shown.set("Show cameras", False)
-    shown.wait(lambda t: not t.scene["/cameras"].visible)
+    shown.wait(lambda t: "/cameras" in t.scene and not t.scene["/cameras"].visible)
     for _ in range(3):
         studio.session.undo()
     shown.wait(lambda t: "/cameras" not in t.scene and not t.has("Show cameras"), LONG)
@@ -130,7 +130,7 @@ def test_clicking_a_photo_opens_it_and_flies_there(shown, studio):
     shown.look(away + np.array([0.3, 0.3, 0.0]), centre)
     shown.click_scene(centre)
     shown.wait(lambda t: tab.photos.image == photo_plots.name(2), LONG)
-    assert studio.wait_idle(LONG)
+    idle(shown, studio)
     assert tab.client.camera.position == pytest.approx(centre, abs=1e-3)
     ahead = np.asarray(tab.client.camera.look_at) - centre
     forward = photo_plots.cam_from_source(2).rotation[2]
@@ -146,10 +146,10 @@ def test_a_photo_behind_the_cloud_or_hidden_is_not_clicked(shown, studio):
     below = points[np.argmin(np.linalg.norm(points[:, :2] - centre[:2], axis=1) + (points[:, 2] > centre[2]) * 99)]
     shown.look(np.array([*centre[:2], below[2] - 4.0]), centre)
     shown.click_scene(centre)
-    assert studio.wait_idle(LONG)
+    idle(shown, studio)
     assert tab.photos.image is None
     shown.set("Show cameras", False)
     shown.look(centre + np.array([0.3, 0.3, 4.0]), centre)
     shown.click_scene(centre)
-    assert studio.wait_idle(LONG)
+    idle(shown, studio)
     assert tab.photos.image is None

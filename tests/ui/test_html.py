@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from dbh_studio.core.dbh import DbhEstimate, Refusal, measure_stem
+from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.settings import MeasureSettings
 from dbh_studio.ui import html
 from dbh_studio.ui.html import TableRow
 from dbh_studio.ui.section_svg import section_svg
 from dbh_studio.ui.steps import PlotStatus
 
+FOURIER = MeasureSettings(curve="fourier", definition="curve")
 ATTACK = "<img src=x onerror=alert(1)>\"'`"
 
 
@@ -24,7 +26,15 @@ def cylinder(radius_m: float = 0.15, *, arc_deg: float = 360.0, n: int = 6000) -
 
 @pytest.fixture(scope="module")
 def estimate() -> DbhEstimate:
-    result = measure_stem(cylinder())
+    """By the paper's Fourier curve, with the other two beside it."""
+    result = measure_stem(cylinder(), settings=FOURIER)
+    assert isinstance(result, DbhEstimate)
+    return result
+
+
+@pytest.fixture(scope="module")
+def half_seen() -> DbhEstimate:
+    result = measure_stem(cylinder(arc_deg=200.0))
     assert isinstance(result, DbhEstimate)
     return result
 
@@ -54,7 +64,7 @@ def test_a_refused_tree_shows_reason_and_remedy_and_no_number():
     assert "Walk round it." in card
     assert "data-dbh" not in card
     assert "no diameter" in card
-    assert "cm DBH" not in card
+    assert "–" not in card
 
 
 def test_an_unknown_diameter_is_a_dash_never_zero():
@@ -175,17 +185,76 @@ def test_a_refusal_without_a_section_has_no_picture():
 
 
 def test_a_refusal_never_shows_a_diameter_in_the_legend():
-    result = measure_stem(cylinder(arc_deg=50), settings=MeasureSettings(min_coverage_deg=180))
+    result = measure_stem(cylinder(arc_deg=50), settings=FOURIER.changed(min_coverage_deg=180))
     assert isinstance(result, Refusal)
     assert " cm</span>" not in section_svg(result, curve="fourier")
-    accepted = measure_stem(cylinder())
+    accepted = measure_stem(cylinder(), settings=FOURIER)
     assert " cm</span>" in section_svg(accepted, curve="fourier")
 
 
 def test_every_curve_can_be_chosen_in_the_legend(estimate):
     picture = section_svg(estimate, curve="ellipse")
     assert re.findall(r'data-choose="(\w+)" aria-pressed="(\w+)"', picture) == [
+        ("shrinkage", "false"),
+        ("circle", "false"),
         ("fourier", "false"),
         ("ellipse", "true"),
         ("bspline", "false"),
     ]
+
+
+def test_the_card_says_the_interval_in_brackets(half_seen):
+    card = html.tree_card(7, half_seen)
+    low, high = half_seen.interval
+    assert f"<b>{half_seen.dbh_cm:.1f}</b>" in card
+    assert f">cm ({low:.1f}–{high:.1f})</small>" in card
+    assert low < 30.0 < high
+    assert f"{np.pi * half_seen.dbh_cm:.1f} (" in card  # the girth, as a tape reads it
+    assert 'data-flag="partial_arc"' in card
+
+
+def test_a_method_without_an_interval_says_so(estimate):
+    card = html.tree_card(7, estimate)
+    assert ">cm</small>" in card
+    assert "none: this method has none" in card
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [
+        (ScaleEstimate(2.0, "marker", 0.01), "±0.5 % of the scale included"),
+        (ScaleEstimate(1.0, "metres"), ""),
+        (ScaleEstimate(2.0, "factor"), "not known"),
+    ],
+)
+def test_the_card_says_whether_the_scale_is_in_the_interval(half_seen, scale, words):
+    said = html.scale_words(scale)
+    assert (words in said) if words else said == ""
+    assert said in html.tree_card(7, half_seen, scale=said)
+
+
+def test_the_unseen_arc_is_dashed_and_the_interval_a_band(half_seen):
+    picture = section_svg(half_seen, curve="shrinkage")
+    outline = re.search(r'<polygon data-curve="shrinkage" [^>]+>', picture)
+    assert outline is not None and "stroke-dasharray" in outline.group()
+    seen = re.search(r'<path data-seen d="([^"]+)"', picture)
+    assert seen is not None
+    assert seen.group(1).count("M") == half_seen.fits["shrinkage"].outline_seen.sum()
+    assert "data-band" in picture and "data-tape" in picture
+    whole = section_svg(measure_stem(cylinder()), curve="shrinkage")
+    drawn = re.search(r'<polygon data-curve="shrinkage" [^>]+>', whole)
+    assert drawn is not None and "stroke-dasharray" not in drawn.group() and "data-seen" not in whole
+
+
+def test_the_band_is_the_interval_on_average(half_seen):
+    fit = half_seen.fits["shrinkage"]
+    low, high = half_seen.interval
+    share = 1.645 * fit.outline_sd_m.mean() / np.hypot(*fit.outline_uv_m.T).mean()
+    assert share == pytest.approx(0.5 * np.log(high / low), rel=0.02)
+
+
+def test_compare_is_offered_until_every_method_was_fitted(half_seen):
+    assert 'data-do="compare"' in section_svg(half_seen, curve="shrinkage")
+    every = measure_stem(cylinder(arc_deg=200.0), curves=("shrinkage", "circle", "fourier", "ellipse", "bspline"))
+    assert 'data-do="compare"' not in section_svg(every, curve="shrinkage")
+    assert every.dbh_cm == half_seen.dbh_cm and every.quality == half_seen.quality

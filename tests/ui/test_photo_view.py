@@ -11,7 +11,7 @@ import photo_plots
 import plots
 import pytest
 from fakeclient import FakeClient
-from panel import LONG
+from panel import LONG, idle
 from PIL import Image
 
 from dbh_studio.app import commands
@@ -109,12 +109,14 @@ def open_photo(studio, client, index, **options):
     n_before = len(calls(client, "frame"))
     on_worker(tab_of(studio), tab_of(studio).photos.open, photo_plots.name(index), **options)
     client.wait(lambda t: len(calls(t, "frame")) > n_before, LONG)
+    client.settle()
 
 
 def next_frame(client, kind, payload):
     n_before = len(calls(client, "frame"))
     client.bridge_send(kind, payload)
     client.wait(lambda t: len(calls(t, "frame")) > n_before, LONG)
+    client.settle()
 
 
 def dot_in(picture):
@@ -297,7 +299,7 @@ def test_a_page_may_say_anything(shown, plot_with_photos):
             shown.bridge_send(kind, payload)
     shown.bridge_send("photo-click", [999, 10, 10])
     shown.bridge_send("photo-click", [0.5, 10, 10])
-    assert plot_with_photos.wait_idle(LONG)
+    idle(shown, plot_with_photos)
     assert tab.photos._look is look and tab.photos.image == photo_plots.name(0) and picked == []
     assert shown.notifications == []
 
@@ -306,7 +308,7 @@ def test_without_anybody_who_wants_it_a_click_does_nothing(shown, plot_with_phot
     open_photo(plot_with_photos, shown, 0)
     number, _, _ = last_frame(shown)
     shown.bridge_send("photo-click", [number, 240, 180])
-    assert plot_with_photos.wait_idle(LONG)
+    idle(shown, plot_with_photos)
     assert shown.notifications == []
 
 
@@ -334,7 +336,8 @@ def test_another_plot_takes_the_photo_away(own, studio, tmp_path):
     path = plots.write_laz(tmp_path / "other", "other.laz")
     studio.adopt(open_plot(path, project_dir=tmp_path / "other" / "other.dbh"))
     own.wait(lambda t: "/cameras" not in t.scene and calls(t, "close"), LONG)
-    assert studio.wait_idle(LONG) and tab_of(studio).photos.image is None
+    idle(own, studio)
+    assert tab_of(studio).photos.image is None
 
 
 def test_a_new_up_direction_turns_the_photo(own, studio):

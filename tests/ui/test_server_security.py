@@ -93,7 +93,7 @@ def test_a_cookie_of_another_program_does_not_lock_anybody_out(server: StudioSer
 
 
 def test_listens_on_loopback_only(server: StudioServer) -> None:
-    with socket.create_connection(("127.0.0.1", server.port), timeout=5):
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60):
         pass
     if sys.platform != "linux":
         pytest.skip("only Linux answers on all of 127.0.0.0/8 without set-up")
@@ -271,6 +271,7 @@ def test_a_tab_cannot_reach_the_private_elements_of_another(server: StudioServer
         other.element("theirs go")
         forge(other, mine.go, value=True)
         events_up_to_go(other, theirs)
+        tab.settle()
     assert mine.events == []
 
 
@@ -424,7 +425,7 @@ def test_stopping_frees_the_port_and_ends_the_tabs() -> None:
         running.stop()
         tab.wait(lambda t: t.closed)
     with pytest.raises(OSError):
-        socket.create_connection(("127.0.0.1", running.port), timeout=2).close()
+        socket.create_connection(("127.0.0.1", running.port), timeout=60).close()
 
 
 # -- rules without a server -----------------------------------------------------------------------------------------

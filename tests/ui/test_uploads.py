@@ -11,6 +11,7 @@ import pytest
 from fakeclient import PART_BYTES, FakeClient
 from hypothesis import given
 from hypothesis import strategies as st
+from panel import LONG
 
 from dbh_studio.errors import EmptyFileError, FileError, UnsupportedFormatError
 from dbh_studio.ui import uploads
@@ -69,9 +70,10 @@ def test_a_file_arrives_whole_with_progress(server: StudioServer, inbox: Inbox, 
     tab.wait(lambda t: len(inbox.contents) > 0 and len(acknowledged(t)) == 3)
     assert inbox.contents == [("oak plot.PLY", content)]
     assert acknowledged(tab) == [PART_BYTES, 2 * PART_BYTES, len(content)]
+    tab.settle()
     assert inbox.progress[-1] == (len(content), len(content))
     assert [a for a, _ in inbox.progress] == sorted(a for a, _ in inbox.progress)
-    assert inbox.worker.join(5) and not inbox.paths[0].exists()  # what the handler did not keep is gone
+    assert inbox.worker.join(LONG) and not inbox.paths[0].exists()  # what the handler did not keep is gone
     assert inbox.button.value.content == b""  # and no copy stays in memory
 
 
@@ -89,14 +91,15 @@ def test_the_file_is_kept_by_receive(inbox: Inbox, tab: FakeClient, tmp_path: Pa
 def refused(tab: FakeClient, inbox: Inbox, server: StudioServer, text: str) -> None:
     note = tab.wait_notification(text)
     assert note.color == "red"
-    assert inbox.worker.join(5) and inbox.contents == [] and n_files_kept(server) == 0
+    tab.settle()
+    assert inbox.worker.join(LONG) and inbox.contents == [] and n_files_kept(server) == 0
 
 
 def test_a_file_over_the_servers_limit_is_refused_at_once(server: StudioServer, inbox: Inbox, tab: FakeClient) -> None:
     tab.upload("Upload", "big.ply", b"x" * (LIMIT + 1))
     refused(tab, inbox, server, "an upload may have 2 MB")
     assert "by its path" in tab.notifications[-1].body
-    assert tab.settle(0.05) and acknowledged(tab) == [LIMIT + 1]  # the page's button is free again
+    assert tab.settle() and acknowledged(tab) == [LIMIT + 1]  # the page's button is free again
 
 
 def test_a_button_may_have_a_lower_limit(server: StudioServer, tab: FakeClient) -> None:
@@ -166,7 +169,7 @@ def test_a_shared_button_keeps_nothing_in_the_replay(server: StudioServer, tab: 
     done = threading.Event()
     worker.on_upload(button, lambda _: done.set(), allowed_suffixes=(".ply",))
     tab.upload("Shared upload", "a.ply", b"x" * (PART_BYTES + 1))
-    assert done.wait(5)
+    assert done.wait(LONG)
     with FakeClient(server.url) as later:
         assert later.has("Shared upload") and acknowledged(later) == []
     worker.close()
@@ -188,13 +191,14 @@ def test_a_closed_tab_leaves_no_partial_file(server: StudioServer) -> None:
 
 def test_files_that_wait_when_the_tab_closes_are_deleted(server: StudioServer, inbox: Inbox, tab: FakeClient) -> None:
     go, started = threading.Event(), threading.Event()
-    inbox.worker.post(lambda: (started.set(), go.wait(5)))
-    assert started.wait(5)
+    inbox.worker.post(lambda: (started.set(), go.wait(LONG)))
+    assert started.wait(LONG)
     tab.upload("Upload", "a.ply", b"abc")
     tab.wait(lambda _: acknowledged(tab) == [3])
     assert n_files_kept(server) == 1
     inbox.worker.close()
     go.set()
+    inbox.worker._thread.join(LONG)
     assert n_files_kept(server) == 0 and inbox.contents == []
 
 
