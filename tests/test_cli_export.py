@@ -127,5 +127,13 @@ def test_a_polygon_comes_from_a_file(saved, tmp_path, capsys):
     assert "Line 3" in fails(capsys, saved, "--out", tmp_path / "b", "--polygon", corners)
 
 
+def test_corners_between_semicolons_may_have_decimal_commas(saved, tmp_path, capsys):
+    corners = tmp_path / "corners.csv"
+    corners.write_text("x;y\n-0,5;-0,5\n99,5;-0,5\n99,5;99,5\n-0,5;99,5\n")
+    succeeds(capsys, saved, "--out", tmp_path / "a", "--format", "xlsx", "--polygon", corners)
+    text = pyogrio.raw.read(tmp_path / "a" / "stand.xlsx", layer="About", force_2d=False)[3]
+    assert any("10,000.0 m² (polygon)" in str(value) for column in text for value in column)
+
+
 def test_a_cloud_is_no_plot(made, tmp_path, capsys):
     assert "no saved plot" in fails(capsys, made / "stand.laz", "--out", tmp_path, status=2)

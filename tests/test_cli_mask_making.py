@@ -220,6 +220,35 @@ def test_a_run_takes_the_ladder_and_the_next_one_what_is_kept(plot, tmp_path, ca
     assert "No kept mask can vote" in message and "3 were rejected" in message
 
 
+def test_masks_made_since_an_earlier_run_are_not_replaced_by_its_masks(plot, tmp_path, capsys):
+    photos = ["--cameras", plot.poses, "--images", plot.folder / "images", "--scale", 0.37]
+    run = ["run", plot.cloud, "--out", tmp_path, *photos, "--quiet"]
+    runs(capsys, *run, "--masks", "auto", "--keyframes", 2, *QUICK)
+    (first, second) = (entry.image for entry in MaskStore(tmp_path / "plot.dbh" / "masks").entries)
+    named = ["--photo", first, "--box-threshold", 0.4]
+    out, _ = runs(capsys, "masks", "make", plot.cloud, *photos, *QUICK, *named, "--json")
+    report = json.loads(out)
+    assert report["n_made"] == 1 and len(set(report["notes"])) == len(report["notes"])
+    runs(capsys, *run, "--masks", "stored", "--overwrite")
+    kept = MaskStore(tmp_path / "plot.dbh" / "masks")
+    thresholds = {entry.image: entry.recipe["options"]["box_threshold"] for entry in kept.entries}
+    assert thresholds == {first: 0.4, second: 0.3}
+
+
+def test_a_damaged_mask_is_told_as_such(saved, tmp_path, capsys):
+    entry = MaskStore(saved / "masks").entries[0]
+    (saved / "masks" / entry.file).write_bytes(b"half")
+    assert "cannot be read" in fails(capsys, 1, "masks", "show", saved, entry.image, tmp_path / "a.jpg")
+
+
+def test_photos_that_are_missing_are_told_once(plot, tmp_path, capsys):
+    own = copied(plot, tmp_path / "own")
+    (own.folder / "images" / "03.jpg").unlink()
+    photos = ["--cameras", own.poses, "--images", own.folder / "images", "--scale", 0.37]
+    out, _ = runs(capsys, "masks", "make", own.cloud, *photos, "--keyframes", 1, *QUICK, "--json")
+    assert sum("not on this computer" in note for note in json.loads(out)["notes"]) == 1
+
+
 def test_a_run_without_models_says_why_it_is_geometry_alone(plot, tmp_path, capsys, without_models):
     photos = ["--cameras", plot.poses, "--images", plot.folder / "images", "--scale", 0.37]
     _, err = runs(capsys, "run", plot.cloud, "--out", tmp_path, *photos, "--masks", "auto")

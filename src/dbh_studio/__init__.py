@@ -17,9 +17,14 @@ or measure one stem that is already cut out, z being the height above the ground
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+# From 1.29 on onnxruntime reports to its makers what it runs, and keeps a number for the computer, from the moment it
+# is imported. Here, so that it is set before anything of this program, or a child of it, imports it.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from dbh_studio.api import Plot, open_plot

@@ -141,6 +141,28 @@ def test_stems_are_grouped_and_ungrouped(document):
     assert edits.ungroup_stems([1]).apply(document) is document
 
 
+def test_a_stem_that_gave_its_number_to_a_tree_leaves_it():
+    trees = {1: TreeRecord(tree_id=1), 2: TreeRecord(tree_id=1), 3: TreeRecord(tree_id=1, species="oak")}
+    document = make_document(make_cloud(), n_trunks=3, trees=trees)
+    after = edits.ungroup_stems([1]).apply(document)
+    assert dict(after.trees) == {2: TreeRecord(tree_id=2), 3: TreeRecord(tree_id=2, species="oak")}
+    # One that is left alone is a tree of its own.
+    assert dict(edits.ungroup_stems([1, 2]).apply(document).trees) == {3: TreeRecord(species="oak")}
+    assert dict(edits.ungroup_stems([3]).apply(document).trees) == {
+        1: TreeRecord(tree_id=1),
+        2: TreeRecord(tree_id=1),
+        3: TreeRecord(species="oak"),
+    }
+
+
+def test_a_number_that_other_stems_have_as_their_tree_is_not_free():
+    trees = {2: TreeRecord(tree_id=7), 3: TreeRecord(tree_id=7)}
+    document = make_document(make_cloud(), n_trunks=3, trees=trees)
+    with pytest.raises(CommandError, match="tree number 7"):
+        edits.renumber_trunk(1, 7).apply(document)
+    assert edits.renumber_trunk(1, 8).apply(document).trunks.ids == (2, 3, 8)
+
+
 def test_deleting_several_is_one_step():
     session, _ = make_session()
     session.do(edits.delete_trunks([4, 2]))

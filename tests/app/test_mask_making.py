@@ -27,6 +27,7 @@ from dbh_studio.app.opening import open_plot, save_as
 from dbh_studio.app.photo_scale import PhotoRequest, add_photos
 from dbh_studio.app.pipeline import segment
 from dbh_studio.app.plot_masks import (
+    carry_masks,
     copy_brought,
     has_masks,
     kept_mask,
@@ -52,7 +53,7 @@ from dbh_studio.errors import (
     StudioError,
     UnscaledCloudError,
 )
-from dbh_studio.io.masks import MaskStore, TrunkMask
+from dbh_studio.io.masks import MaskRecipe, MaskStore, TrunkMask
 from dbh_studio.io.models import ModelStore
 from dbh_studio.settings import MaskDetectorSettings, ModelRunSettings
 
@@ -233,6 +234,58 @@ def test_what_a_person_painted_votes_and_is_never_made_anew(made, models):
         put_painted(made, photo, TrunkMask(np.zeros((128, 128), np.uint16)))
     with pytest.raises(FileError, match="not found"):
         put_painted(made, replace(photo, path=None), painted)
+
+
+def test_what_a_person_painted_and_rejected_is_not_made_anew_either(plot, made, models):
+    there = tuple(plot_masks(made).entries)
+    painted, kept = made.cameras.posed.by_name(there[0]), mask_store(made).entry(there[0]).file
+    put_painted(made, painted, TrunkMask(np.ones((128, 256), np.uint16)))
+    set_review(made, painted.name, "rejected")
+    before = (masks_folder(made) / kept).read_bytes()
+    for request in (MakeRequest(photos=there, settings=WHOLE), MakeRequest(photos=there, settings=TILES, redo=True)):
+        plan = plan_masks(made, replace(request, run=RUN), models=models)
+        assert painted.name not in [each.name for each in plan.photos] and len(plan.photos) == N_MADE - 1
+    given = brought(plot, made, meaning="labels", categories=("1-9",))
+    assert copy_brought(masks_folder(made), given, made.cameras.posed, names=[painted.name]) == ()
+    assert (masks_folder(made) / kept).read_bytes() == before
+    assert mask_store(made).entry(painted.name).review == "rejected"
+
+
+def test_what_a_person_brought_or_accepted_is_not_made_anew_unasked(plot, made, models):
+    there = tuple(plot_masks(made).entries)
+    set_review(made, there[0], "accepted")
+    given = brought(plot, made, meaning="labels", categories=("1-9",))
+    assert copy_brought(masks_folder(made), given, made.cameras.posed, names=[there[1]]) == ()
+    for settings in (WHOLE, TILES):
+        plan = plan_masks(made, MakeRequest(photos=there, settings=settings, run=RUN), models=models)
+        assert not {there[0], there[1]} & {each.name for each in plan.photos}
+    redo = plan_masks(made, MakeRequest(photos=there, settings=WHOLE, run=RUN, redo=True), models=models)
+    assert {there[0], there[1]} <= {each.name for each in redo.photos}
+
+
+def test_masks_made_in_several_ways_vote_together_and_that_is_told(made, models):
+    assert not any("ways" in note for note in plot_masks(made).notes)
+    other = MakeRequest(photos=tuple(plot_masks(made).entries)[:1], settings=WHOLE, run=RUN)
+    masks_for_plot(made, other, models=models)
+    assert any("made in 2 ways" in note and "--redo" in note for note in plot_masks(made).notes)
+
+
+def test_a_photo_named_twice_is_made_once(session, models):
+    plan = plan_masks(session, MakeRequest(photos=("01.jpg", "00.jpg", "01.jpg"), settings=WHOLE), models=models)
+    assert [photo.name for photo in plan.photos] == ["01.jpg", "00.jpg"]
+
+
+def test_an_undone_search_by_masks_is_said_to_be_no_longer_that_of_the_plot(made):
+    segment(made, in_process=True)
+    assert made.last_search.remarks(made.document) == ()
+    n_trunks = len(made.document.trunks)
+    trunks_from_masks(made, plot_masks(made, made.cameras.posed))
+    assert made.last_search.remarks(made.document) == () and len(made.document.trunks) == n_trunks
+    made.undo()
+    (remark,) = made.last_search.remarks(made.document)
+    assert "by masks" in remark and "another way" in remark and kept_votes(made) is None
+    made.redo()
+    assert made.last_search.remarks(made.document) == () and kept_votes(made) is not None
 
 
 def test_a_changed_recipe_makes_masks_anew_and_the_same_does_not(made, models):
@@ -436,6 +489,27 @@ def test_masks_of_a_plot_that_is_not_saved_move_with_saving(plot, models, tmp_pa
     save_as(session, tmp_path / "b.dbh", background=False)
     assert len(MaskStore(tmp_path / "a.dbh" / "masks")) == len(MaskStore(tmp_path / "b.dbh" / "masks")) == 1
     session.close()
+
+
+def test_of_two_places_the_masks_written_last_are_taken_but_painted_ones_stay(plot, tmp_path):
+    recipe, photos = MaskRecipe("grounded_sam"), plot.folder / "images"
+    run, cache = MaskStore(tmp_path / "run"), MaskStore(tmp_path / "cache")
+    sizes = {"old": (8, 4), "new": (16, 8), "painted": (32, 16)}
+    shapes = {name: TrunkMask(np.ones((height, width), np.uint16)) for name, (width, height) in sizes.items()}
+    run.put("00.jpg", photos / "00.jpg", shapes["old"], recipe)
+    run.put("01.jpg", photos / "01.jpg", shapes["painted"], MaskRecipe("painted"), review="repainted")
+    run.put("02.jpg", photos / "02.jpg", shapes["old"], recipe)
+    cache.put("00.jpg", photos / "00.jpg", shapes["new"], recipe)
+    cache.put("01.jpg", photos / "01.jpg", shapes["new"], recipe)
+    os.utime(run.folder / "index.jsonl", ns=(10**18, 10**18))
+    carry_masks(run.folder, cache.folder, move=False, newer_wins=True)
+    taken = MaskStore(cache.folder)
+    assert [taken.get(name).size for name in ("00.jpg", "01.jpg", "02.jpg")] == [(16, 8), (32, 16), (8, 4)]
+    # What was done since in the place they came from counts again.
+    run.set_review("00.jpg", "rejected")
+    os.utime(run.folder / "index.jsonl", ns=(4 * 10**18, 4 * 10**18))
+    carry_masks(run.folder, cache.folder, move=False, newer_wins=True)
+    assert MaskStore(cache.folder).entry("00.jpg").review == "rejected"
 
 
 # ---- brought ones

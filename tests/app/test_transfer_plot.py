@@ -237,6 +237,10 @@ def test_nothing_is_overwritten_unasked(files, photo, done):
         transfer_plot(*photo_side(photo), again)
     once_more = transfer_plot(*photo_side(photo), replace(again, overwrite=True))
     assert once_more.project_dir.exists()
+    # Also by another way there.
+    around = once_more.project_dir / ".." / once_more.project_dir.name
+    with pytest.raises(ProjectExistsError, match="would be overwritten"):
+        transfer_plot(*photo_side(photo), replace(again, lidar=around, overwrite=True))
 
 
 def test_what_makes_no_sense_is_told(files, photo, tmp_path):

@@ -385,3 +385,21 @@ def test_field_tape_of_eight_real_stems():
         errors.append(result.dbh_cm - float(row["dbh_cm"]))
     assert np.sqrt(np.mean(np.square(errors))) < 1.5
     assert len(errors) == 8
+
+
+def test_a_curve_beside_the_chosen_one_has_the_scales_error_and_its_own_points():
+    points = stem(circle(), noise=0.01)
+    points[:, :2] += [3.0, -2.0]
+    chosen = MeasureSettings(curve="shrinkage")
+    sure, unsure = (
+        dbh.measure_stem(points, settings=chosen, curves=["circle"], scale_sd=sd).fits["circle"] for sd in (0.0, 0.05)
+    )
+    assert unsure.diameter("tape").half_width > 2.0 * sure.diameter("tape").half_width
+    assert unsure.diameter("tape").value_cm == sure.diameter("tape").value_cm
+    alone = dbh.measure_stem(points, settings=MeasureSettings(curve="circle"), curves=[]).fits["circle"]
+    assert abs(int(sure.inliers.sum()) - int(alone.inliers.sum())) <= 0.01 * len(points)
+
+
+def test_a_paper_curve_is_compared_with_the_scales_error_too():
+    fits = [measure_stem(stem(circle()), curves=["shrinkage"], scale_sd=sd).fits["shrinkage"] for sd in (0.0, 0.05)]
+    assert fits[1].diameter("tape").half_width > 2.0 * fits[0].diameter("tape").half_width

@@ -438,3 +438,27 @@ class TestParts:
         assert shift == pytest.approx(-0.010, abs=0.003)
         assert 0 < sd < 0.006
         assert surface_shift(smeared, 0.008, chance=0.0) == (0.0, 0.0)
+
+
+def heap(seed, kind):
+    """Points of a shrub without any stem: a box, or a cloud that thins outwards."""
+    rng = np.random.default_rng(seed)
+    n, width = int(rng.integers(1500, 6000)), rng.uniform(0.6, 1.5)
+    across = rng.uniform(-width / 2, width / 2, (n, 2)) if kind == "box" else rng.normal(0, width / 3, (n, 2))
+    return np.column_stack([across, rng.uniform(0.0, 3.0, n)])
+
+
+@pytest.mark.parametrize("method", ["ring", "circle"])
+@pytest.mark.parametrize("kind", ["box", "cloud"])
+def test_a_heap_of_points_has_no_diameter_though_rings_can_be_laid_through_it(method, kind):
+    found = [assess_stem(heap(seed, kind), settings=EstimatorSettings(method=method)) for seed in range(10)]
+    assert sum(each.refusal is not None and each.refusal.code == "no_ring" for each in found) >= 7
+
+
+@pytest.mark.parametrize("method", ["ring", "circle"])
+@pytest.mark.parametrize("scenario", ["full, noisy", "clutter", "drift", "bloat", "small", "lidar", "neighbour"])
+def test_no_stem_is_taken_for_a_heap(method, scenario):
+    settings = EstimatorSettings(method=method)
+    for case in _cases(scenario, range(5000, 5004)):
+        refusal = assess_stem(case.points_m, settings=settings).refusal
+        assert refusal is None or refusal.code != "no_ring"

@@ -118,4 +118,6 @@ def test_a_plot_without_stems_has_no_means():
     assert table.rows == () and table.total.qmd is None and table.total.stems_per_area == 0
     assert table.class_edges == () and table.total.classes == ()
     only_refused = stand_table(rows((None, 0, 0, "", None)), PlotArea.circle((0, 0), 5.0))
-    assert only_refused.total.n_refused == 1 and only_refused.total.mean is None and only_refused.total.basal_area == 0
+    assert (
+        only_refused.total.n_refused == 1 and only_refused.total.mean is None and only_refused.total.basal_area is None
+    )

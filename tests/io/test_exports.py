@@ -123,6 +123,14 @@ def test_geojson_is_longitude_and_latitude(tmp_path):
     assert made["features"][1]["properties"]["dbh_cm"] is None and "note" not in made
 
 
+def test_a_place_that_no_longitude_has_is_left_out(tmp_path):
+    rows = stems(UTM).rows
+    nowhere = Inventory.of([replace(rows[0], easting=1e30, northing=1e30), *rows[1:]])
+    written = json.loads(write_geojson(tmp_path / "a.geojson", table_of(nowhere)).read_text())
+    assert written["features"][0]["geometry"] is None
+    assert written["features"][1]["geometry"] is not None
+
+
 def test_geojson_without_a_map_system_says_so(tmp_path):
     made = json.loads(write_geojson(tmp_path / "stems.geojson", table_of(stems())).read_text("utf-8"))
     assert "no coordinate reference system" in made["note"]
@@ -172,6 +180,8 @@ def test_a_dxf_has_circles_of_the_stems_and_their_numbers(tmp_path):
     ring = np.frombuffer(geometry[layers.index("STEMS")][9:], "<f8")
     ring = ring.reshape(-1, 3 if len(ring) % 3 == 0 and len(ring) % 2 else 2)[:, :2]
     assert np.hypot(*ring.T) == pytest.approx(0.15625, abs=1e-4)
+    feet = write_dxf(tmp_path / "feet.dxf", table_of(stems(2227))).read_text("ascii")  # California zone 3, US feet
+    assert f"\n40\n{0.15625 / 0.3048006:.4f}\n" in feet
     assert write_dxf(tmp_path / "utm.dxf", table_of(stems(UTM))).read_text("ascii").count("500004.") >= 1
 
 

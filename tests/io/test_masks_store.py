@@ -159,8 +159,12 @@ def test_lines_that_are_no_entries_are_passed_over(tmp_path):
     index = tmp_path / "m" / "index.jsonl"
     good = json.loads(index.read_text().splitlines()[1])
     bad = [{**good, "file": "../../secret.png"}, {**good, "width_px": -1}, {**good, "more": 1}, {**good, "review": 3}]
+    bad += [{**good, "scores": {"1": "a"}}, {**good, "n_trunks": None}, {**good, "recipe": {}}]
+    bad += [{**good, "recipe": {"method": ["painted"]}}]
     index.write_text(index.read_text() + "".join(json.dumps(line) + "\n" for line in [*bad, [], 7]) + "no json\n\x00\n")
     assert MaskStore(tmp_path / "m").get("a", path, RECIPE) is not None
+    (entry,) = MaskStore(tmp_path / "m").entries
+    assert (entry.recipe, entry.scores, entry.n_trunks) == (good["recipe"], good["scores"], good["n_trunks"])
 
 
 def test_a_newer_programs_masks_are_left_alone(tmp_path):
@@ -274,6 +278,15 @@ def test_whether_a_mask_is_of_a_photo_as_it_is_now(tmp_path):
     assert not store.is_of("b.jpg", path)
     path.write_bytes(b"other pixels")
     assert not store.is_of("a.jpg", path) and store.is_of("a.jpg", None)
+
+
+def test_a_copied_photo_is_read_once_to_see_that_it_is_the_same(tmp_path, monkeypatch):
+    store, path = MaskStore(tmp_path / "masks"), photo(tmp_path)
+    store.put("a.jpg", path, trunks(), RECIPE)
+    os.utime(path, ns=(10**18, 10**18))
+    assert store.is_of("a.jpg", path)
+    monkeypatch.setattr("builtins.open", lambda *_, **__: pytest.fail("the photo was read again"))
+    assert store.is_of("a.jpg", path)
 
 
 def test_a_stored_mask_is_read_without_its_store_and_a_damaged_one_is_told(tmp_path):

@@ -6,6 +6,8 @@ import copy
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +54,15 @@ def store_of(data: dict, folder: Path, **options: object) -> ModelStore:
     folder.mkdir(exist_ok=True)
     (folder / "list.json").write_text(json.dumps(data))
     return ModelStore(read_manifest(folder / "list.json"), folder / "models", **options)
+
+
+def test_running_a_model_reports_to_nobody(graphs, tmp_path):
+    code = "import sys, pathlib\nfrom dbh_studio.io.models import open_graph\nopen_graph(pathlib.Path(sys.argv[1]))"
+    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    home = {name: str(tmp_path) for name in ("HOME", "USERPROFILE", "XDG_CACHE_HOME", "LOCALAPPDATA")}
+    subprocess.run([sys.executable, "-c", code, str(graphs / "model.onnx")], env=environment | home, check=True)
+    # Where it reports, it leaves the number it knows this computer by.
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
 @pytest.fixture

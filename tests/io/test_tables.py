@@ -257,6 +257,19 @@ def test_each_method_has_its_own_interval():
     assert set(table.intervals_cm) == {"dbh_area_cm", "dbh_cm"}
 
 
+def test_an_interval_is_not_taken_for_that_of_another_method():
+    table = read(
+        "stem,dbh_cm,dbh_lo_cm,dbh_hi_cm,fourier_cm\n1,30,29,31,40\n2,20,19,21,28\n", Reading(diameters=("fourier_cm",))
+    )
+    assert table.diameters_cm["dbh"].tolist() == [40.0, 28.0] and not table.intervals_cm
+
+
+def test_the_ends_of_a_girths_interval_are_girths():
+    table = read("tree,girth_cm,girth_lo_cm,girth_hi_cm\n1,100,90,110\n2,60,50,70\n")
+    assert table.diameters_cm["dbh"] == pytest.approx(np.array([100, 60]) / np.pi)
+    assert table.intervals_cm["dbh"] == pytest.approx(np.array([[90, 110], [50, 70]]) / np.pi)
+
+
 def test_a_wrong_name_is_answered_with_the_nearest():
     with pytest.raises(MalformedFileError, match=r"no column DHB\. Did you mean DBH\?"):
         read("id,DBH\n1,30\n", Reading(columns={"dbh": "DHB"}))

@@ -116,6 +116,9 @@ def test_disorder_and_doubles_are_put_right_and_told(tmp_path):
         (["1 2 3 4 5"] * 12, UnsupportedFormatError, "5 numbers a line"),
         (["time,x,y,z", "1,1,1,1", "a,b,c,d", "e,f,g,h"], MalformedFileError, r"2 of its 3 lines.*line 3"),
         (["5 0 0 0 0 0 0 1"] * 12, FileError, "one time"),
+        (["time,x,y,z", "1,1,1,1", *[f'{k},"' + "a" * 200_000 for k in range(3)]], MalformedFileError, "3 of its 4"),
+        (['"' + "a" * 200_000 + ",x"], UnsupportedFormatError, "names no x, y and z"),
+        (["time,x,y,z", *[f"{k},1e300,{k}e299,1e300" for k in range(9)]], MalformedFileError, "9 of its 9"),
     ],
 )
 def test_what_is_wrong_is_told(tmp_path, lines, error, match):
@@ -132,6 +135,9 @@ def test_missing_files_and_times_that_do_not_fit(tmp_path):
         read_trajectory(path, times=written(tmp_path / "few.txt", ["1", "2", "3", "4", "5"]))
     with pytest.raises(MalformedFileError, match="no list of times"):
         read_trajectory(path, times=written(tmp_path / "words.txt", ["1", "two"]))
+    for odd in ("inf", "nan", "1e300"):
+        with pytest.raises(MalformedFileError, match="times are no numbers"):
+            read_trajectory(path, times=written(tmp_path / "odd.txt", [*"12345678901", odd]))
     with pytest.raises(ValueError, match="rate"):
         read_trajectory(path, rate_hz=0.0)
 

@@ -238,7 +238,7 @@ def _offers_from(about: dict[str, Any], point_sets: Sequence[Any]) -> Offers:
     candidates = []
     for points, row in zip(point_sets, about["candidates"], strict=True):
         x, y, diameter, kind, reason, n_seen, n_called = row
-        if kind not in get_args(CandidateKind) or points[-1] >= about["n_points"] or len(points) < LEAST_POINTS:
+        if kind not in get_args(CandidateKind) or len(points) < LEAST_POINTS or points[-1] >= about["n_points"]:
             raise ValueError("a candidate in it cannot be")
         numbers = (float(x), float(y)), float(diameter)
         candidates.append(CandidateTrunk(points, *numbers, kind, str(reason), int(n_seen), int(n_called)))

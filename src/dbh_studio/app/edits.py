@@ -185,6 +185,8 @@ def renumber_trunk(trunk_id: int, new_id: int) -> Command:
             raise CommandError(f"There is a trunk {new_id} already.", "Choose a number that is free.")
         if not 0 < new_id <= MAX_TRUNK_ID:
             raise CommandError(f"A trunk cannot have the number {new_id}.", "Choose a number from 1.")
+        if any(i != trunk_id and each.tree_id == new_id for i, each in document.trees.items()):
+            raise CommandError(f"Other stems go by the tree number {new_id}.", "Choose another, or group the stems.")
         after = document.trunks.without(trunk_id).with_trunk(replace(trunk, id=new_id))
         # The stems of a tree go by the number of one of them.
         moved = {
@@ -223,6 +225,11 @@ def ungroup_stems(ids: Iterable[int]) -> Command:
         records = {
             i: replace(document.record(i), tree_id=None) for i in wanted if document.record(i).tree_id is not None
         }
+        for head in wanted:
+            # A stem alone is the tree of its own number: those that went by it go by another now.
+            left = sorted(i for i, each in document.trees.items() if each.tree_id == head and i not in wanted)
+            new_head = left[0] if len(left) > 1 else None
+            records |= {i: replace(document.record(i), tree_id=new_head) for i in left}
         return _with(document, document.trunks, records) if records else document
 
     return Command(f"Ungroup stems {_listed(wanted)}", apply)

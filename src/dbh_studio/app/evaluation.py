@@ -280,7 +280,7 @@ def stem_numbers(comparison: Comparison) -> dict[str, int]:
     """The studio's number of each stem of the first inventory, by the number it has in the evaluation."""
     table = comparison.inventories[0]
     own = table.cells.get("stem_id", table.ids)
-    return {name: int(text) for name, text in zip(table.ids, own, strict=True) if text.isdigit()}
+    return {name: int(text) for name, text in zip(table.ids, own, strict=True) if text.isdecimal()}
 
 
 def _spread(ordered: Sequence[Sample]) -> list[tuple[str, Sample]]:

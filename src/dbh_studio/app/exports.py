@@ -228,7 +228,9 @@ def _corners(path: Path) -> Float64:
         raise FileError(path, f"The corners cannot be read ({error}).") from None
     corners = []
     for number, line in enumerate(text.splitlines(), start=1):
-        parts = line.replace(";", " ").replace(",", " ").split()
+        # Where semicolons divide, a comma is the decimal sign.
+        divided = line.replace(",", ".").replace(";", " ") if ";" in line else line.replace(",", " ")
+        parts = divided.split()
         if not parts or parts[0].startswith("#"):
             continue
         try:

@@ -57,6 +57,9 @@ class LastSearch:
             remarks.append("Settings have changed since: find the trunks again to see what that does.")
         if self.n_trunks != len(document.trunks):
             remarks.append(f"It found {self.n_trunks} trunks; the plot has {len(document.trunks)} now.")
+        elif self.steps.from_masks != (document.masks is not None):
+            how = "masks" if self.steps.from_masks else "geometry"
+            remarks.append(f"It looked for trunks by {how}; those of the plot now were found another way.")
         return tuple(remarks)
 
 

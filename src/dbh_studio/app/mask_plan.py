@@ -288,9 +288,10 @@ def _chosen_photos(
 ) -> tuple[tuple[PosedImage, ...], int, float | None]:
     """The photos to do, in order; how many masks stay; and what share is then covered."""
     here = {photo.name: Path(photo.path) for photo in posed if photo.path is not None}
-    to_do = set(store.to_do(here, recipe))
     if request.redo:
         to_do = {name for name in here if not _is_painted(store, name)}
+    else:
+        to_do = {name for name in store.to_do(here, recipe) if not _is_settled(store, name, here[name])}
     done = [name for name in here if name not in to_do]
     if request.photos:
         strange = sorted(set(request.photos) - set(here))
@@ -298,7 +299,8 @@ def _chosen_photos(
             raise CommandError(
                 f"There is no photo {strange[0]} on this computer.", "`dbh-studio masks list` shows all."
             )
-        return tuple(posed.by_name(name) for name in request.photos if name in to_do), len(done), None
+        named = dict.fromkeys(request.photos)
+        return tuple(posed.by_name(name) for name in named if name in to_do), len(done), None
     rows = {photo.name: row for row, photo in enumerate(posed)}
     rejected = [rows[name] for name in done if _is_rejected(store, name)]
     already = sorted(set(rows[name] for name in done) - set(rejected))
@@ -316,7 +318,15 @@ def _chosen_photos(
 
 def _is_painted(store: MaskStore, name: str) -> bool:
     entry = store.entry(name)
-    return entry is not None and entry.review == "repainted"
+    return entry is not None and entry.is_painted
+
+
+def _is_settled(store: MaskStore, name: str, photo: Path) -> bool:
+    """Whether a person brought or accepted the mask: another recipe is no reason to make it anew."""
+    entry = store.entry(name)
+    if entry is None or not (entry.review == "accepted" or entry.recipe.get("method") == "imported"):
+        return False
+    return store.is_of(name, photo)
 
 
 def _is_rejected(store: MaskStore, name: str) -> bool:

@@ -111,10 +111,11 @@ def _photos(session: Session, request: LadderRequest, *, in_process: bool, progr
 def _photos_if_any(
     session: Session, request: LadderRequest, *, in_process: bool, progress: Progress
 ) -> tuple[Cameras | None, str]:
-    """The photos, and why there are none: only those a person named must be there."""
+    """The photos, and why there are none: only those a person named, now or earlier, must be there."""
     try:
         return _photos(session, request, in_process=in_process, progress=progress), ""
     except (FileError, CommandError) as error:
-        if request.cameras is not None or request.make.rung != "auto":
+        is_named = request.cameras is not None or session.document.cameras is not None
+        if is_named or request.make.rung != "auto":
             raise
-        return None, f"Photos were looked for: {error.problem}"
+        return None, f"Photos were looked for: {error}"

@@ -425,7 +425,7 @@ def _by_ladder(
     from dbh_studio.app.mask_run import take_ladder
 
     if kept_before is not None:
-        carry_masks(kept_before / MASKS_FOLDER, masks_folder(session), move=False)
+        carry_masks(kept_before / MASKS_FOLDER, masks_folder(session), move=False, newer_wins=True)
     taken = take_ladder(session, request, in_process=in_process, progress=progress)
     return taken.masks, taken.notes
 

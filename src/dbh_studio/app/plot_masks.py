@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from dbh_studio.io.masks import MaskStore, Review, StoredMask, TrunkMask
 
 MASKS_FOLDER = "masks"
+_INDEX = "index.jsonl"
 _UNSAVED = "unsaved-masks"
 _METHODS: dict[str, Literal["detector", "prompted", "brought"]] = {
     "grounded_sam": "detector",
@@ -67,28 +68,43 @@ def mask_store(session: Session) -> MaskStore:
 
 def has_masks(session: Session) -> bool:
     """Whether any mask is kept for the plot."""
-    return (masks_folder(session) / "index.jsonl").is_file()
+    return (masks_folder(session) / _INDEX).is_file()
 
 
-def carry_masks(before: Path, after: Path, *, move: bool) -> None:
+def carry_masks(before: Path, after: Path, *, move: bool, newer_wins: bool = False) -> None:
     """Bring the masks of one place to another that may have some already; of a photo that both have, that of `before`.
 
     Args:
         before: A folder of masks; nothing is done where there is none.
         after: The folder they come to.
         move: Leave nothing behind: for the masks of a plot that was not saved yet.
+        newer_wins: Of a photo that both have, take what a person painted, else that of the place written last.
 
     Raises:
         FileError: They cannot be read or written.
     """
     from dbh_studio.io.masks import MaskStore
 
-    if before == after or not (before / "index.jsonl").is_file():
+    if before == after or not (before / _INDEX).is_file():
         return
-    MaskStore(after).take(MaskStore(before))
+    theirs, own = MaskStore(before), MaskStore(after)
+    own.take(theirs, _wanted(theirs, own) if newer_wins else None)
     if move:
         with suppress(OSError):
             shutil.rmtree(before)
+
+
+def _wanted(theirs: MaskStore, own: MaskStore) -> frozenset[str]:
+    """The photos whose mask is better than the own one: painted, else from the place that was written last."""
+    if not len(own):
+        return frozenset(entry.image for entry in theirs.entries)
+    times = [(store.folder / _INDEX).stat().st_mtime_ns for store in (theirs, own)]
+    wanted = set()
+    for entry in theirs.entries:
+        mine = own.entry(entry.image)
+        if mine is None or (entry.is_painted if entry.is_painted != mine.is_painted else times[0] > times[1]):
+            wanted.add(entry.image)
+    return frozenset(wanted)
 
 
 # ---- as the voting asks for them
@@ -179,6 +195,7 @@ def masks_that_vote(store: MaskStore, posed: PosedImages | None = None, *, only_
     photos = None if posed is None else {photo.name: photo.path for photo in posed}
     voting: dict[str, StoredMask] = {}
     n_rejected = n_strange = n_waiting = n_painted = 0
+    recipes: set[str] = set()
     for entry in store.entries:
         if photos is not None and (entry.image not in photos or not store.is_of(entry.image, photos[entry.image])):
             n_strange += 1
@@ -187,7 +204,8 @@ def masks_that_vote(store: MaskStore, posed: PosedImages | None = None, *, only_
         elif only_accepted and not entry.review:
             n_waiting += 1
         else:
-            n_painted += entry.review == "repainted"
+            n_painted += entry.is_painted
+            recipes |= set() if entry.is_painted else {entry.key}
             voting[entry.image] = entry
     of = "" if photos is None else f" of {len(photos):,} photos"
     notes = [f"{len(voting):,} masks{of} are kept beside the plot and vote."]
@@ -199,6 +217,11 @@ def masks_that_vote(store: MaskStore, posed: PosedImages | None = None, *, only_
     ):
         if count:
             notes.append(f"{count:,} {text}")
+    if len(recipes) > 1:
+        notes.append(
+            f"They were made in {len(recipes)} ways (models, prompt or settings differ); reject those that are not "
+            "to vote, or make all alike: `dbh-studio masks make --redo --keyframes all`."
+        )
     return PlotMasks(store.folder, voting, tuple(notes))
 
 
@@ -298,9 +321,8 @@ def review_in(store: MaskStore, name: str, review: Review) -> None:
     entry = store.entry(name)
     if entry is None:
         raise CommandError(f"There is no kept mask of {name}.", "`dbh-studio masks list` shows which there are.")
-    painted = entry.recipe.get("method") == "painted"
     # What was painted stays so when its acceptance is taken back: no model may make it anew.
-    store.set_review(name, "repainted" if painted and review in ("", "accepted") else review)
+    store.set_review(name, "repainted" if entry.is_painted and review in ("", "accepted") else review)
 
 
 def put_painted(session: Session, photo: PosedImage, mask: TrunkMask) -> StoredMask:
@@ -378,7 +400,7 @@ def copy_brought(
     for index, photo in enumerate(photos):
         progress(index / len(photos), f"Mask {index + 1} of {len(photos)}")
         entry = store.entry(photo.name)
-        if entry is not None and entry.review == "repainted":
+        if entry is not None and entry.is_painted:
             continue
         try:
             path, mask = _file_of(photo), masks.mask(photo.name)

@@ -9,6 +9,7 @@ walks of the two sensors as in the paper, else by the stems), carries the labels
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -247,7 +248,7 @@ def output_paths(request: TransferRequest) -> tuple[Path, Path]:
 def check_outputs(request: TransferRequest) -> None:
     """Raise ProjectExistsError or FileError where the results would take the place of something."""
     project_dir, csv_path = output_paths(request)
-    if request.lidar.absolute() == project_dir.absolute():
+    if os.path.realpath(request.lidar) == os.path.realpath(project_dir):
         raise ProjectExistsError(
             f"{project_dir.name} is what the trunks are to be carried to, and would be overwritten.",
             "Choose another folder (--out).",

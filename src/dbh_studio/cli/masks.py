@@ -216,7 +216,7 @@ def _as_json(plan: MaskPlan, made: MadeMasks | None, ladder: Ladder) -> dict[str
         "n_made": 0 if made is None else made.n_made,
         "seconds_per_photo": None if made is None else made.seconds_per_photo,
         "problems": {} if made is None else dict(made.problems),
-        "notes": [*plan.notes, *([] if made is None else made.notes)],
+        "notes": list(plan.notes if made is None else made.notes),
         "ladder": ladder.as_json(),
     }
 
@@ -262,14 +262,16 @@ def show_mask(options: argparse.Namespace) -> int:
     """Write a photo with its mask."""
     from dbh_studio.app.mask_overlay import check_overlay_path, save_overlay
     from dbh_studio.io.masks import overlay
+    from dbh_studio.io.masks.store import read_stored
     from dbh_studio.io.photos import read_photo
 
     check_overlay_path(options.picture)
     with _kept(options, write=False) as (store, posed):
-        mask = store.get(options.photo)
+        entry = store.entry(options.photo)
         photo = next((each for each in posed if each.name == options.photo), None)
-        if mask is None or photo is None:
+        if entry is None or photo is None:
             raise CommandError(f"There is no kept mask of {options.photo}.", "`dbh-studio masks list` shows all.")
+        mask = read_stored(store.folder, entry)
         save_overlay(options.picture, overlay(read_photo(photo), mask))
         if options.json:
             print(json.dumps({"photo": photo.name, "picture": str(options.picture), "trunks": list(mask.numbers)}))

@@ -164,10 +164,10 @@ def _measure_file(
     from dbh_studio.core.dbh import CurveFit, DbhEstimate, measure_stem
     from dbh_studio.settings import CurveName
 
-    points = _points_of(path, options)
+    points, scale_sd = _points_of(path, options)
     base = float(points[:, 2].min()) if options.ground_z is None else options.ground_z
     points[:, 2] -= base
-    result = measure_stem(points, settings=settings, curves=get_args(CurveName))
+    result = measure_stem(points, settings=settings, curves=get_args(CurveName), scale_sd=scale_sd)
     row: dict[str, Any]
     if isinstance(result, DbhEstimate):
         section = result.section
@@ -184,27 +184,30 @@ def _measure_file(
             "lean_deg": round(section.lean_deg, 1) if section.axis_source == "stem" else None,
             "taper_cm_per_m": None if result.taper_cm_per_m is None else round(result.taper_cm_per_m, 2),
             "quality": result.quality,
-            "flags": "; ".join(result.flags),
+            "reason": "; ".join(result.flags),
+            "flags": ";".join(result.flag_codes),
         }
     else:
-        row = {"quality": "refused", "reason": result.reason, "remedy": result.remedy}
+        row = {"quality": "refused", "reason": result.reason, "remedy": result.remedy, "flags": result.code}
     for name, fit in result.fits.items():
         if isinstance(fit, CurveFit):
             row[f"{name}_cm"] = round(100 * fit.diameter_m(settings.definition), 2)
-    return row, _profile(points, result, row, settings) if options.profile is not None else []
+    return row, _profile(points, result, row, settings, scale_sd) if options.profile is not None else []
 
 
 def _profile(
-    points: Float64, result: DbhEstimate | Refusal, row: dict[str, Any], settings: MeasureSettings
+    points: Float64, result: DbhEstimate | Refusal, row: dict[str, Any], settings: MeasureSettings, scale_sd: float
 ) -> list[dict[str, Any]]:
-    """The rows of a stem's profile; what it says against the diameter is added to the flags in `row`."""
+    """The rows of a stem's profile; what it says against the diameter is added to `row`, in words and as a flag."""
     from dbh_studio.core.dbh import DbhEstimate
     from dbh_studio.core.stem_profile import breast_height_flag, stem_profile
 
-    profile = stem_profile(points, settings=settings)
+    profile = stem_profile(points, settings=settings, scale_sd=scale_sd)
     if isinstance(result, DbhEstimate):
         flag = breast_height_flag(profile, result.hom_m, result.diameters[result.definition])
-        row["flags"] = "; ".join(filter(None, (row["flags"], flag.words if flag is not None else "")))
+        if flag is not None:
+            row["reason"] = "; ".join(filter(None, (row["reason"], flag.words)))
+            row["flags"] = ";".join(filter(None, (row["flags"], flag.code)))
     rows = []
     for point in profile:
         cells: dict[str, Any] = {"height_m": f"{point.height_m:.2f}", "reason": point.reason}
@@ -228,8 +231,8 @@ def _intervals(result: DbhEstimate) -> dict[str, float | None]:
     return cells
 
 
-def _points_of(path: Path, options: argparse.Namespace) -> Float64:
-    """(N, 3) float64 points of a stem file in metres, z up, absolute heights kept."""
+def _points_of(path: Path, options: argparse.Namespace) -> tuple[Float64, float]:
+    """(N, 3) float64 points of a stem file in metres, z up, absolute heights kept; the scale's relative error."""
     import numpy as np
 
     from dbh_studio.app.opening import open_plot
@@ -241,4 +244,4 @@ def _points_of(path: Path, options: argparse.Namespace) -> Float64:
     points = session.points_world().astype(np.float64)
     # x and y stay local: only the height's origin matters here.
     points[:, 2] += origin[2]
-    return points
+    return points, session.document.scale.relative_sd

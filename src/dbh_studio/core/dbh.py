@@ -90,7 +90,7 @@ def measure_stem(
             "Look at the stem: remove what is not bark, or delete it if it is no tree.",
         )
     finite_points = points[finite]
-    fits = {name: compared_fit(name, finite_points, section, settings, seed) for name in names}
+    fits = {name: compared_fit(name, finite_points, section, settings, seed, scale_sd=scale_sd) for name in names}
     return _judged(section, fits, settings, ground_note, axis)
 
 

@@ -131,9 +131,12 @@ class InstanceGatherer:
         inside = np.zeros(self._n_cubes, bool)
         inside[self._cube[voters]] = True
         n_cubes, bits = int(np.count_nonzero(inside)), np.packbits(inside)
+        # A part is few of all cubes: only the bytes that hold some of it are looked at, photo by photo.
+        at = np.flatnonzero(bits)
+        bits = bits[at]
         n_seen = n_called = 0
         for seen, (cubes, _) in zip(self._seen, self._covered, strict=True):
-            n_here = int(_ONES[seen & bits].sum())
+            n_here = int(_ONES[seen[at] & bits].sum())
             if n_cubes and n_here >= max(_IN_VIEW * n_cubes, 1):
                 n_seen += 1
                 n_called += int(np.count_nonzero(inside[cubes])) >= _CALLED * n_here

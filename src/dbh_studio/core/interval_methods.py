@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Int64, readonly
+from dbh_studio.core.arrays import Float64, Int64, readonly
 from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.curve_fits import fit_curve
 from dbh_studio.core.curves import CURVES
@@ -23,6 +23,7 @@ from dbh_studio.core.measured import CurveFit, DbhEstimate, Flag, Refusal
 from dbh_studio.core.quality import FAIR_HALF_WIDTH, grade_of_interval
 from dbh_studio.core.robust import canonical_order
 from dbh_studio.core.section import CrossSection
+from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings, MeasureSettings
 
 INTERVAL_METHODS: Mapping[str, Literal["ring", "circle"]] = {"shrinkage": "ring", "circle": "circle"}
@@ -83,8 +84,12 @@ def measured_with_interval(
     result = found.result
     indices = np.flatnonzero(np.isfinite(points).all(axis=1))
     section = _section(points, indices, result, settings)
-    fits: dict[str, CurveFit | Refusal] = {settings.curve: _as_fit(settings.curve, result, section)}
-    fits.update((name, compared_fit(name, finite, section, settings, seed)) for name in curves if name not in fits)
+    fits: dict[str, CurveFit | Refusal] = {settings.curve: _as_fit(settings.curve, result, section.uv_m)}
+    fits.update(
+        (name, compared_fit(name, finite, section, settings, seed, scale_sd=scale_sd))
+        for name in curves
+        if name not in fits
+    )
     if found.refusal is not None:
         return replace(found.refusal, section=section, fits=fits)
     return _estimate(result, settings, section, fits, ground_note)
@@ -156,14 +161,14 @@ def _section(
     )
 
 
-def _as_fit(name: str, result: EstimatorResult, section: CrossSection) -> CurveFit:
-    """The estimator's outline as one of the section's curves."""
+def _as_fit(name: str, result: EstimatorResult, uv_m: Float64) -> CurveFit:
+    """The estimator's outline as one of the curves on (N, 2) section points, in the estimator's own coordinates."""
     outline = result.outline_uv_m
     perimeter, area, girth = outline_metrics(outline)
     radius = np.hypot(outline[:, 0], outline[:, 1])
-    angle = np.arctan2(section.uv_m[:, 1], section.uv_m[:, 0])
+    angle = np.arctan2(uv_m[:, 1], uv_m[:, 0])
     there = np.interp(angle, np.arange(len(radius)) * (2 * np.pi / len(radius)), radius, period=2 * np.pi)
-    error = np.abs(np.hypot(section.uv_m[:, 0], section.uv_m[:, 1]) - there)
+    error = np.abs(np.hypot(uv_m[:, 0], uv_m[:, 1]) - there)
     # As sure as the diameter on the whole, and as uneven as the posterior.
     sd = result.outline_sd_m * (result.log_sd * float(radius.mean()) / max(float(result.outline_sd_m.mean()), 1e-9))
     return CurveFit(
@@ -181,7 +186,13 @@ def _as_fit(name: str, result: EstimatorResult, section: CrossSection) -> CurveF
 
 
 def compared_fit(
-    name: str, points: NDArray[np.floating[Any]], section: CrossSection, settings: MeasureSettings, seed: int
+    name: str,
+    points: NDArray[np.floating[Any]],
+    section: CrossSection,
+    settings: MeasureSettings,
+    seed: int,
+    *,
+    scale_sd: float = 0.0,
 ) -> CurveFit | Refusal:
     """One method's curve on a section, beside the chosen one.
 
@@ -191,14 +202,19 @@ def compared_fit(
         section: Of the chosen method.
         settings: Of the measurement.
         seed: Of the random samples.
+        scale_sd: Relative standard error of the scale, for the methods with an interval.
     """
     if name in CURVES:
         return fit_curve(name, section, settings, seed)
-    found = assess_stem(points, settings=estimator_settings(settings, name), seed=seed)
+    found = assess_stem(points, settings=estimator_settings(settings, name), scale_sd=scale_sd, seed=seed)
     if found.result is None or found.refusal is not None:
         assert found.refusal is not None
         return found.refusal
     moved = section.stem_from_section.inverse() @ found.result.stem_from_section
-    fit = _as_fit(name, found.result, section)
-    outline = moved.apply(np.column_stack([fit.outline_uv_m, np.zeros(len(fit.outline_uv_m))]))[:, :2]
-    return replace(fit, outline_uv_m=readonly(outline))
+    fit = _as_fit(name, found.result, _on_plane(moved.inverse(), section.uv_m))
+    return replace(fit, outline_uv_m=readonly(_on_plane(moved, fit.outline_uv_m)))
+
+
+def _on_plane(motion: Similarity, uv_m: Float64) -> Float64:
+    """(N, 2) points of one section plane, on another."""
+    return np.asarray(motion.apply(np.column_stack([uv_m, np.zeros(len(uv_m))]))[:, :2], np.float64)

@@ -100,7 +100,8 @@ class InventoryRow:
         quality: ``good``, ``fair``, ``poor``, or ``refused`` where `dbh_cm` is None.
         reason: Why it is refused, or what to look at; `remedy` says what would help.
         x_m: With `y_m` and `z_ground_m`, in the world frame: metres about the plot's local origin, z up.
-        scale_err_pct: Standard error of the scale; every length has it on top of its own.
+        scale_err_pct: Standard error of the scale. The intervals have it in them; every other length has it on top of
+            its own error.
         easting: With `northing`, in the source's coordinate reference system, where it has one.
     """
 

@@ -123,7 +123,8 @@ def _paired(
 def _parts(a: StemTable, b: StemTable) -> tuple[list[_Part], tuple[tuple[int, ...], tuple[int, ...]], list[str]]:
     """The plots both tables have; the rows of the others; what to know about it."""
     mine, theirs = [id_key(p) for p in a.plots], [id_key(p) for p in b.plots]
-    common = [plot for plot in dict.fromkeys(theirs) if plot in set(mine)]
+    have = set(mine)
+    common = [plot for plot in dict.fromkeys(theirs) if plot in have]
     everything = [_Part("", np.arange(len(a)), np.arange(len(b)))]
     if not (a.has_plots and b.has_plots):
         return everything, ((), ()), []
@@ -135,13 +136,11 @@ def _parts(a: StemTable, b: StemTable) -> tuple[list[_Part], tuple[tuple[int, ..
             "Name the plots alike, name the column they stand in, or say that one table has no plots.",
         )
     shown = {key: plot for key, plot in zip(theirs, b.plots, strict=True)}
-    parts = [
-        _Part(shown[p], np.flatnonzero([q == p for q in mine]), np.flatnonzero([q == p for q in theirs]))
-        for p in common
-    ]
+    my_rows, their_rows = _rows_by_plot(mine), _rows_by_plot(theirs)
+    parts = [_Part(shown[p], np.array(my_rows[p], np.int64), np.array(their_rows[p], np.int64)) for p in common]
     outside = (
-        tuple(i for i, plot in enumerate(mine) if plot not in common),
-        tuple(i for i, plot in enumerate(theirs) if plot not in common),
+        tuple(i for i, plot in enumerate(mine) if plot not in their_rows),
+        tuple(i for i, plot in enumerate(theirs) if plot not in my_rows),
     )
     notes = [
         f"{len(rows)} stems of {table.name} are of plots that {other.name} does not have, and are not counted."
@@ -149,6 +148,13 @@ def _parts(a: StemTable, b: StemTable) -> tuple[list[_Part], tuple[tuple[int, ..
         if rows
     ]
     return parts, outside, notes
+
+
+def _rows_by_plot(plots: list[str]) -> dict[str, list[int]]:
+    rows: dict[str, list[int]] = {}
+    for row, plot in enumerate(plots):
+        rows.setdefault(plot, []).append(row)
+    return rows
 
 
 def _some(names: tuple[str, ...]) -> str:
@@ -254,11 +260,11 @@ def _by_position(a: StemTable, b: StemTable, part: _Part, rule: PairingRule, fou
     mine, theirs = _with_place(a, part.inventory), _with_place(b, part.reference)
     frame, pairs, distance, following = lay_on(a.xy_m[mine], b.xy_m[theirs], rule=rule, plot=part.plot)
     found.frames.append(frame)
-    found.rows += [(int(mine[i]), int(theirs[j])) for i, j in pairs]
+    paired = [(int(mine[i]), int(theirs[j])) for i, j in pairs]
+    found.rows += paired
     found.distance += distance.tolist()
     found.following += following.tolist()
-    paired = set(found.rows)
-    beyond = _beyond(frame, a.xy_m, b.xy_m[theirs], rule.max_distance_m)
+    beyond = set(mine[_beyond(frame, a.xy_m[mine], b.xy_m[theirs], rule.max_distance_m)].tolist())
     for table, rows, placed, taken, other, into in (
         (a, part.inventory, mine, {i for i, _ in paired}, b, found.extra),
         (b, part.reference, theirs, {j for _, j in paired}, a, found.missed),
@@ -269,7 +275,7 @@ def _by_position(a: StemTable, b: StemTable, part: _Part, rule: PairingRule, fou
                 into[row] = f"it has no place in {table.name}"
             elif row not in taken:
                 alone = f"no stem of {other.name} within {rule.max_distance_m:g} m that is not taken"
-                into[row] = frame.reason or (OUT_OF_AREA if into is found.extra and beyond[row] else alone)
+                into[row] = frame.reason or (OUT_OF_AREA if into is found.extra and row in beyond else alone)
 
 
 def _beyond(frame: FrameFit, xy_m: Float64, target_m: Float64, margin_m: float) -> Bool:

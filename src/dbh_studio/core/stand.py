@@ -120,7 +120,7 @@ class StandRow:
         n_stems: Stems, those without a diameter included.
         n_refused: Stems without a diameter.
         stems_per_area: Per hectare or acre.
-        basal_area: m² per hectare or ft² per acre, of the stems measured.
+        basal_area: m² per hectare or ft² per acre, of the stems measured; None where all of them are refused.
         qmd: Quadratic mean diameter, cm or inches; None where no stem is measured.
         mean: Arithmetic mean diameter, likewise.
         least: Smallest diameter, likewise.
@@ -133,7 +133,7 @@ class StandRow:
     n_stems: int
     n_refused: int
     stems_per_area: float
-    basal_area: float
+    basal_area: float | None
     qmd: float | None
     mean: float | None
     least: float | None
@@ -205,13 +205,14 @@ def stand_table(
         shown = dbh_cm * to_unit
         counts = np.histogram(shown, edges)[0] if len(edges) > 1 else np.empty(0)
         has = len(shown) > 0
+        basal_area = float(np.sum(np.pi / 4 * (dbh_cm / 100) ** 2)) * per_area * to_basal
         return StandRow(
             species=species,
             n_trees=len({row.tree_id for row in part}),
             n_stems=len(part),
             n_refused=len(part) - len(dbh_cm),
             stems_per_area=len(part) * per_area,
-            basal_area=float(np.sum(np.pi / 4 * (dbh_cm / 100) ** 2)) * per_area * to_basal,
+            basal_area=basal_area if has or not part else None,
             qmd=float(np.sqrt(np.mean(shown**2))) if has else None,
             mean=float(shown.mean()) if has else None,
             least=float(shown.min()) if has else None,
@@ -221,7 +222,7 @@ def stand_table(
 
     names = sorted({row.species for row in chosen})
     by_species = [of(name, [row for row in chosen if row.species == name]) for name in names]
-    by_species.sort(key=lambda row: (-row.basal_area, row.species))
+    by_species.sort(key=lambda row: (-(row.basal_area or 0.0), row.species))
     return StandTable(
         tuple(by_species),
         of("", chosen),

@@ -14,7 +14,17 @@ import numpy as np
 from dbh_studio.core.arrays import Float64, readonly
 from dbh_studio.core.stem_table import MAIN, StemTable
 from dbh_studio.errors import FileError, MalformedFileError, SettingError
-from dbh_studio.io.table_diameters import CM_PER, FIA, UNITS, Unit, diameter_rank, diameters_of, problem_notes, unit_of
+from dbh_studio.io.table_diameters import (
+    CM_PER,
+    FIA,
+    UNITS,
+    Unit,
+    diameter_rank,
+    diameters_of,
+    is_girth,
+    problem_notes,
+    unit_of,
+)
 from dbh_studio.io.tables import CellTable, cells_of, is_unknown, numbers, plain_name, read_cells
 
 Role = Literal["id", "plot", "x", "y", "dbh", "low", "high"]
@@ -199,7 +209,9 @@ class _Roles:
         """(N, 2) ends of the interval of the diameters in a column, centimetres; None where the table has none."""
         base = self.names[column].removesuffix("_cm")
         lows, highs = [f"{base}_lo_cm"], [f"{base}_hi_cm"]
-        if is_main:
+        # Ends without a method's name belong to the column without one.
+        owners = [each for each, plain in self.names.items() if plain in ("dbh_cm", "dbh")]
+        if is_main and (column in owners or not owners):
             lows, highs = [*lows, *_LOW], [*highs, *_HIGH]
         # A share of the stems may have an interval only, so these columns may be nearly empty.
         low = (self.named("low") if is_main else None) or self.first_of(lows, at_least=0.0)
@@ -209,7 +221,8 @@ class _Roles:
         ends = []
         for end in (low, high):
             factor = CM_PER[unit_of(self.names[end]) or unit]
-            ends.append(factor * numbers(self.cells.columns[end]))
+            values = factor * numbers(self.cells.columns[end])
+            ends.append(values / np.pi if is_girth(self.names[column]) else values)
         both = np.column_stack(ends)
         both[both[:, 0] > both[:, 1]] = np.nan
         return readonly(both) if np.isfinite(both).all(axis=1).any() else None

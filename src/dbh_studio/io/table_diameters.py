@@ -38,7 +38,7 @@ def unit_of(plain: str) -> Unit | None:
 
 def diameter_rank(plain: str) -> int | None:
     """How surely a heading means a diameter or a girth at breast height, 0 the surest."""
-    tokens = [token for k, token in enumerate(plain.split("_")) if not (k and token in _UNIT_WORDS)]
+    tokens = _without_unit(plain)
     base = "_".join(tokens)
     if plain == "dbh_cm":
         return 0
@@ -53,6 +53,16 @@ def diameter_rank(plain: str) -> int | None:
     return 4 if base == "d" else None
 
 
+def is_girth(plain: str) -> bool:
+    """Whether a heading means a girth."""
+    return "_".join(_without_unit(plain)) in _GIRTH
+
+
+def _without_unit(plain: str) -> list[str]:
+    """The words of a heading but its unit."""
+    return [token for k, token in enumerate(plain.split("_")) if not (k and token in _UNIT_WORDS)]
+
+
 def diameters_of(
     cells: CellTable, column: str, unit: Unit | None, name: str
 ) -> tuple[Float64, tuple[str, ...], Unit, str]:
@@ -60,13 +70,13 @@ def diameters_of(
     texts = cells.columns[column]
     values = numbers(texts)
     plain = plain_name(column)
-    is_girth = "_".join(t for k, t in enumerate(plain.split("_")) if not (k and t in _UNIT_WORDS)) in _GIRTH
-    if is_girth:
+    by_girth = is_girth(plain)
+    if by_girth:
         values = values / np.pi
     why = ""
     if unit is None:
         unit, why = _unit(values, plain, cells)
-    if is_girth:
+    if by_girth:
         why += ", a girth, divided by π"
     diameters = CM_PER[unit] * values
     reasons = _reasons(cells)

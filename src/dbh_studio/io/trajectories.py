@@ -50,6 +50,8 @@ _UNITS_S = {"ns": 1e-9, "nsec": 1e-9, "us": 1e-6, "µs": 1e-6, "usec": 1e-6, "ms
 # Seconds since 1970 are 1.7e9 now; the same in smaller units is larger by thousands.
 _LARGEST_S, _LARGEST_MS, _LARGEST_US = 1e11, 1e14, 1e17
 _MOST_BAD_SHARE = 0.5
+# Beyond nanoseconds since 1970: sums of squares of larger numbers overflow.
+_BEYOND_REASON = 1e20
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,6 +232,8 @@ def with_times(read: RecordedTrajectory, path: Path) -> RecordedTrajectory:
         times = np.array([float(re.split(r"[,;\s]+", row)[0]) for row in rows])
     except ValueError:
         raise MalformedFileError(path, "It is no list of times, one a line.", "Give one time a line.") from None
+    if not (np.abs(times) < _BEYOND_REASON).all():
+        raise MalformedFileError(path, "Some of its times are no numbers.", "Give one time a line.")
     if len(times) != len(read):
         raise MalformedFileError(
             path,
@@ -245,7 +249,10 @@ def with_times(read: RecordedTrajectory, path: Path) -> RecordedTrajectory:
 def _cells(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+    except csv.Error:  # a quotation that never ends, or a byte no table has: no pose
+        return [line]
 
 
 def _plain(text: str) -> str:
@@ -304,7 +311,7 @@ def _numbers(
         cells = _cells(row, delimiter)
         if len(cells) > max(columns) and (wanted is not None or len(cells) == width):
             values[index] = [_number(cells[column]) for column in columns]
-    good = np.isfinite(values).all(axis=1)
+    good = (np.abs(values) < _BEYOND_REASON).all(axis=1)
     if not len(rows):
         raise EmptyFileError(path, "It holds no pose.", "Export the trajectory again.")
     n_bad = int((~good).sum())

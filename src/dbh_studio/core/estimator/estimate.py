@@ -26,6 +26,7 @@ from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
+_LOOK = "Look at the stem: remove what is not bark, or delete it if it is no tree."
 _REMEDY = "Record the stem from its other side, or enter a tape value."
 
 
@@ -233,6 +234,8 @@ def _refusal(
     found: _Found, settings: EstimatorSettings, chosen: Diameter, spread: Spread, log_sd: float
 ) -> Refusal | None:
     """Why a result may not be given; None where it may."""
+    if found.evidence.is_heap(is_askew=found.method == "circle" and settings.axis == "vertical"):
+        return _no_surface(settings)
     if spread.depth_noise > settings.max_depth_noise:
         return _too_shallow(found, spread)
     if not settings.min_diameter_cm <= chosen.value_cm <= settings.max_diameter_cm:
@@ -338,7 +341,16 @@ def _no_ring(local: Float64, settings: EstimatorSettings) -> Refusal:
     return Refusal(
         "no_ring",
         f"The {len(local)} points about {settings.breast_height_m:.2f} m above ground do not form a ring.",
-        "Look at the stem: remove what is not bark, or delete it if it is no tree.",
+        _LOOK,
+    )
+
+
+def _no_surface(settings: EstimatorSettings) -> Refusal:
+    """Why a heap of points has no diameter, though some ring can be laid through any."""
+    return Refusal(
+        "no_ring",
+        f"The points about {settings.breast_height_m:.2f} m above ground fill the place evenly; no ring stands out.",
+        _LOOK,
     )
 
 

@@ -102,21 +102,22 @@ def write_dxf(path: Path | str, table: Table, *, area: PlotArea | None = None) -
     """
     path = Path(path)
     on_map = table.inventory.n_measured > 0 and any(row.easting is not None for row in table.inventory)
+    metre = 1.0 / _metres_per_map_unit(table) if on_map else 1.0
     groups: list[tuple[int, object]] = [(0, "SECTION"), (2, "ENTITIES")]
     for row in table.inventory:
         x, y = (row.easting, row.northing) if on_map else (row.x_m, row.y_m)
         if x is None or y is None:
             continue
         if row.dbh_cm is not None:
-            radius = row.dbh_cm / 200
+            radius = metre * row.dbh_cm / 200
             groups += [(0, "CIRCLE"), (8, "STEMS"), (10, x), (20, y), (30, 0.0), (40, radius)]
         else:
-            radius = _CROSS_M / 2
+            radius = metre * _CROSS_M / 2
             for sign in (1.0, -1.0):
                 groups += [(0, "LINE"), (8, "REFUSED"), (10, x - radius), (20, y - sign * radius), (30, 0.0)]
                 groups += [(11, x + radius), (21, y + sign * radius), (31, 0.0)]
-        groups += [(0, "TEXT"), (8, "NUMBERS"), (10, x + radius + 0.05), (20, y), (30, 0.0)]
-        groups += [(40, _TEXT_M), (1, str(row.stem_id))]
+        groups += [(0, "TEXT"), (8, "NUMBERS"), (10, x + radius + 0.05 * metre), (20, y), (30, 0.0)]
+        groups += [(40, metre * _TEXT_M), (1, str(row.stem_id))]
     outline = [] if on_map else _outline(area)
     for (xa, ya), (xb, yb) in zip(outline, outline[1:] + outline[:1], strict=True):
         groups += [(0, "LINE"), (8, "PLOT"), (10, xa), (20, ya), (30, 0.0), (11, xb), (21, yb), (31, 0.0)]
@@ -125,6 +126,18 @@ def write_dxf(path: Path | str, table: Table, *, area: PlotArea | None = None) -
     with written_whole(path) as file:
         file.write("".join(lines).encode("ascii"))
     return path
+
+
+def _metres_per_map_unit(table: Table) -> float:
+    """Of the plot's map system, which may be in feet; 1 where that cannot be known."""
+    codes = {row.epsg for row in table.inventory if row.epsg is not None}
+    try:
+        import pyproj
+    except ImportError:
+        return 1.0
+    if len(codes) != 1:
+        return 1.0
+    return float(pyproj.CRS.from_epsg(codes.pop()).axis_info[0].unit_conversion_factor)
 
 
 def _placed(table: Table) -> list[InventoryRow]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,9 @@ def positions_lon_lat(table: Table) -> list[list[float] | None] | None:
             placed.append(None)
             continue
         longitude, latitude = transformer.transform(row.easting, row.northing)
-        placed.append([round(longitude, _DEGREE_DIGITS), round(latitude, _DEGREE_DIGITS)])
+        # Infinite where the place lies outside what the system can say.
+        is_somewhere = math.isfinite(longitude) and math.isfinite(latitude)
+        placed.append([round(longitude, _DEGREE_DIGITS), round(latitude, _DEGREE_DIGITS)] if is_somewhere else None)
     return placed
 
 

@@ -12,8 +12,9 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -89,6 +90,11 @@ class StoredMask:
     recipe: Mapping[str, Any]
     key: str
     review: Review = ""
+
+    @property
+    def is_painted(self) -> bool:
+        """Whether a person painted it, rejected since or not: it must not be made anew."""
+        return self.review == "repainted" or self.recipe.get("method") == "painted"
 
 
 class MaskStore:
@@ -194,10 +200,14 @@ class MaskStore:
         entry = self._entries.get(image)
         return entry is not None and self._is_current(entry, None if photo is None else Path(photo), None)
 
-    def take(self, other: MaskStore) -> None:
-        """Copy all masks of another store, with what a person said of them; of a photo that both have, the other's.
+    def take(self, other: MaskStore, images: Container[str] | None = None) -> None:
+        """Copy masks of another store, with what a person said of them; of a photo that both have, the other's.
 
         Each is either here or not, whenever this is interrupted.
+
+        Args:
+            other: The store.
+            images: Only of these photos; None takes all.
 
         Raises:
             FileError: A picture cannot be read, or the folder cannot be written.
@@ -205,6 +215,8 @@ class MaskStore:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             for entry in other.entries:
+                if images is not None and entry.image not in images:
+                    continue
                 try:
                     data = (other.folder / entry.file).read_bytes()
                 except FileNotFoundError:
@@ -252,8 +264,7 @@ class MaskStore:
             return False
 
     def _is_current(self, entry: StoredMask, photo: Path | None, recipe: MaskRecipe | None) -> bool:
-        is_painted = entry.review == "repainted"
-        if recipe is not None and entry.key != recipe.key and not is_painted:
+        if recipe is not None and entry.key != recipe.key and not entry.is_painted:
             return False
         return photo is None or _is_same_photo(photo, entry.photo)
 
@@ -351,6 +362,9 @@ def _entry_from(data: dict[str, Any] | None) -> StoredMask | None:
         and all(isinstance(n, int) and n > 0 for n in (entry.width_px, entry.height_px))
         and all(isinstance(part, dict) for part in (entry.scores, entry.photo, entry.recipe))
         and entry.review in get_args(Review)
+        and isinstance(entry.n_trunks, int)
+        and all(isinstance(score, (int, float)) for score in entry.scores.values())
+        and isinstance(entry.recipe.get("method"), str)
     )
     return entry if is_sound else None
 
@@ -360,14 +374,20 @@ def _photo_state(photo: Path, *, with_digest: bool) -> dict[str, Any]:
         status = Path(photo).stat()
         state: dict[str, Any] = {"bytes": status.st_size, "mtime_ns": status.st_mtime_ns}
         if with_digest:
-            digest = hashlib.sha256()
-            with open(photo, "rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-            state["sha256"] = digest.hexdigest()
+            state["sha256"] = _digest(str(Path(photo).absolute()), status.st_size, status.st_mtime_ns)
         return state
     except OSError as error:
         raise FileError(photo, f"The photo cannot be read ({error.strerror or error}).", "Copy it again.") from error
+
+
+@lru_cache(maxsize=10_000)
+def _digest(photo: str, _n_bytes: int, _mtime_ns: int) -> str:
+    """Of a file as it is at this size and time: of a copied folder, all photos are asked for at every look."""
+    digest = hashlib.sha256()
+    with open(photo, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def _is_same_photo(photo: Path, then: Mapping[str, Any]) -> bool:
