@@ -46,9 +46,10 @@ PATIENCE_S = 300.0
 PANEL = "the panel"
 OF_SCALE = ("scale", "corners", "photos", "markers")
 OF_MASKS = ("masks", "label-count")
-# White, the three curves, the ring, the marks of good, fair, poor and refused, the bars of the hints.
+# White, the curves, the tape, the ring, the marks of good, fair, poor and refused, the bars of the hints.
 KEPT = [ImageColor.getrgb(c) for c in (
-    "#ffffff", "#d9480f", "#0b7285", "#a61e8c", "#143cbe", "#2b8a3e", "#e8890c", "#c92a2a", "#868e96", "#f59f00",
+    "#ffffff", "#1864ab", "#5f3dc4", "#d9480f", "#0b7285", "#a61e8c", "#e8590c", "#143cbe", "#2b8a3e",
+    "#e8890c", "#c92a2a", "#868e96", "#f59f00",
     "#e03131", "#37b24d", "#1c7ed6", "#ebfbee", "#fff9db", "#fff5f5", "#e7f5ff", "#fff3bf", "#40c057", "#212529",
 )]  # fmt: skip
 
@@ -310,22 +311,38 @@ def tour(camera: Photographer, folder: Path) -> None:
     results = {i: studio.session.measurement(i).result for i in studio.session.document.trunks.ids}
     good = [i for i, r in results.items() if isinstance(r, DbhEstimate) and r.quality == "good"]
     partly = [i for i, r in results.items() if isinstance(r, DbhEstimate) and r.quality == "poor"]
-    refused = [i for i, r in results.items() if not r]
     camera.choose(good[len(good) // 2])
     camera.take("inspect")
     camera.take("card", clip=".dbh-card")
     if partly:
         camera.choose(partly[0])
         camera.take("poor")
-    if refused:
-        camera.choose(refused[0])
-        camera.take("refused")
+    no_diameter(camera)
     page.click("#dbh-view button[data-look=plot]")
     page.click("#dbh-view button[data-mode='Segmentation (by tree)']")
     camera.step("export")
     camera.take("export")
     if not camera.wanted or "steps" in camera.wanted:
         lost_trees(camera)
+
+
+def no_diameter(camera: Photographer) -> None:
+    """A tree that is refused; where none is, one that a curve of the paper refuses."""
+    session = camera.studio.session
+    assert session is not None
+    if camera.wanted and "refused" not in camera.wanted:
+        return
+    own = session.document.settings.measure.curve
+    for curve in (own, "fourier"):
+        session.do(change_settings("measure", curve=curve))
+        camera.settle()
+        refused = [i for i in session.document.trunks.ids if not session.measurement(i).result]
+        if refused:
+            camera.choose(refused[0])
+            camera.take("refused")
+            break
+    session.do(change_settings("measure", curve=own))
+    camera.settle()
 
 
 def lost_trees(camera: Photographer) -> None:

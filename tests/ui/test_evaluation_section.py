@@ -36,6 +36,7 @@ def compare(tab: FakeClient, field) -> None:
     tab.set("Field table", str(field))
     tab.press("Compare")
     tab.wait_text("Median bias", LONG)
+    tab.wait(lambda t: "data-pair=" in t.html(), LONG)  # it comes last
 
 
 def test_bias_scatter_and_the_trees_without_a_pair(measured, field):
@@ -94,6 +95,19 @@ def test_a_change_of_the_plot_is_told(measured, studio, field):
     measured.wait_text("The plot has changed since")
     measured.press("Compare")
     measured.wait(lambda t: "The plot has changed since" not in t.text(), LONG)
+
+
+def test_another_plot_begins_with_empty_fields(measured, studio, field, tmp_path):
+    compare(measured, field)
+    measured.wait(lambda t: t.value("Report folder"))
+    (tmp_path / "other").mkdir()
+    studio.adopt(plots.measured_session(tmp_path / "other"))
+    measured.wait_text("Click a trunk in the picture", LONG)
+    open_step(measured)
+    measured.wait(lambda t: t.value("Field table") == "", LONG)
+    compare(measured, field)
+    # Else the report would be written over that of the first plot.
+    measured.wait(lambda t: t.value("Report folder").startswith(str(tmp_path / "other")), LONG)
 
 
 @pytest.mark.parametrize(

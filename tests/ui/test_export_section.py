@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pyogrio
+from panel import LONG
 
-LONG = 60.0
+from dbh_studio.app import commands
+
 TITLE = "Write the files"
 
 
@@ -25,6 +27,18 @@ def test_the_chosen_files_are_written_to_the_folder(measured, tmp_path):
     (layer,) = folder.glob("*.gpkg")
     meta, _, _, _ = pyogrio.raw.read(layer)
     assert "dbh_cm" in meta["fields"].tolist()
+
+
+def test_files_of_an_earlier_state_are_told(measured, studio, tmp_path):
+    to_export(measured)
+    measured.set("Folder", "beside the plot")
+    for box in ("Map layer (GeoPackage)", "Excel, with stand table"):
+        measured.set(box, False)
+    measured.press(TITLE)
+    measured.wait_text("Written to", LONG)
+    assert (studio.session.saver.folder.parent / "beside the plot").is_dir()
+    studio.session.do(commands.set_tree_record(studio.session.document.trunks.ids[0], note="checked"))
+    measured.wait_text("The plot has changed since", LONG)
 
 
 def test_files_that_are_there_are_not_replaced_unasked(measured, tmp_path):

@@ -19,6 +19,7 @@ from dbh_studio.app.brought_masks import MaskRequest, read_masks
 from dbh_studio.app.plot_masks import take_over_brought
 from dbh_studio.io.masks import MEANING_TITLES, MaskStore
 from dbh_studio.io.models import ModelStore
+from dbh_studio.settings import VoteSettings
 from dbh_studio.ui.server import start_server
 from dbh_studio.ui.studio import Studio
 
@@ -149,6 +150,8 @@ def test_without_models_the_way_that_is_taken_is_told_and_what_the_others_need(t
     assert "No detector and no segmenter is on this computer." in text
     assert "dbh-studio models add FOLDER" in text and "All ways and what they cost" in text
     assert "--" not in text.replace("---", "")
+    # What gets the models stands with the ways that need them, not with the masks a person brings.
+    assert text.index("dbh-studio models add") < text.index("Masks you bring:") < text.index("Name their folder")
     assert not tab.has("Make masks") and not tab.has("Find trunks from the masks")
 
 
@@ -465,6 +468,16 @@ def test_trunks_are_found_from_masks_and_the_cloud_shows_the_label_counts(masked
         again.close()
 
 
+def test_who_paints_is_not_taken_away_when_the_first_trunks_are_found(masked, studio, files):
+    shown = open_photo(masked, studio, NAMES[0])
+    masked.bridge_send("mask-do", ["paint", None])
+    masked.wait(lambda t: row(t)["tool"] == "add", LONG)
+    studio.mask_jobs.find_trunks(VoteSettings())
+    masked.wait(lambda _: len(studio.session.document.trunks) == 4, LONG)
+    idle(masked, studio)
+    assert (shown.view.step, row(masked)["tool"]) == ("trunks", "add")
+
+
 def test_rejected_masks_do_not_vote(masked, studio, files):
     for name in NAMES:
         studio.masks.review(name, "rejected")
@@ -498,6 +511,19 @@ def test_masks_are_made_by_models_stopped_and_gone_on_with(tab, studio, plot, tm
         assert studio.masks.why_not() == ""
     found = [kept(studio).get(name) for name in NAMES]
     assert sum(len(mask.numbers) for mask in found) > 0
+
+
+def test_another_plot_opened_while_masks_are_made_hears_nothing_of_them(tab, studio, plot, tmp_path):
+    studio.masks.use_models(mask_plots.tiny_models(tmp_path / "tiny", detector=True))
+    with FakeClient(studio.server.url) as client:
+        go_to_trunks(client)
+        client.wait(lambda t: t.has("Make masks"), LONG)
+        client.set("Photos", "all")
+        client.press("Make masks")
+        client.wait(lambda _: studio.masks.writing, LONG)
+        studio.adopt(mask_plots.open_session(plot, tmp_path / "other.dbh"))
+        idle(client, studio)
+        assert (studio.mask_jobs.undone, studio.mask_jobs.said, studio.masks.why_not()) == (None, (), "")
 
 
 def test_what_is_half_typed_about_making_is_told_only_when_it_is_used(tab, studio, plot, tmp_path):

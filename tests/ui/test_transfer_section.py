@@ -111,7 +111,8 @@ def test_refusals_are_sentences_and_leave_nothing(studio, tab, files, tmp_path):
     tab.set("Scanner's path", str(short))
     tab.set("LiDAR cloud", str(files.photo))
     start(tab, studio)
-    tab.wait_notification("does not tell how long its unit is", LONG)
+    note = tab.wait_notification("does not tell how long its unit is", LONG)
+    assert "name its saved plot" in note.body and "--" not in note.body
     assert not (tmp_path / "photo_lidar.dbh").exists()
 
 

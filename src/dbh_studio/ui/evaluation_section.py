@@ -35,6 +35,7 @@ class EvaluationSection:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self._done: tuple[Session, Document, EvaluationRequest, Comparison] | None = None
+        self._shown_for: Session | None = None
         gui, worker = tab.client.gui, tab.worker
         self._folder = gui.add_folder("Compare with field measurements", expand_by_default=False, visible=False)
         with self._folder:
@@ -61,8 +62,10 @@ class EvaluationSection:
         """Say what was found, and whether the plot has changed since."""
         session = self.tab.session
         set_visible(self._folder, session is not None and len(session.document.trunks) > 0)
-        if self._done is not None and self._done[0] is not session:
-            self._done = None
+        if session is not self._shown_for:  # of another plot: its report must not be written over
+            self._shown_for, self._done = session, None
+            for field in (self._path, self._out):
+                set_value(field, "")
         for handle in (self._plot, self._worst, self._out, self._write):
             set_visible(handle, self._done is not None)
         if self._done is None or session is None:

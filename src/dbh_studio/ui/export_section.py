@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from dbh_studio.ui.panels.base import set_content, set_disabled, set_value, set_
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from dbh_studio.app.document import Document
     from dbh_studio.ui.tab import Tab
 
 _LABELS: dict[Format, str] = {
@@ -44,6 +46,7 @@ class ExportSection:
         self.tab = tab
         self._shown_for: object = None
         self._written: tuple[Path, ...] = ()
+        self._written_of: Document | None = None
         gui, worker = tab.client.gui, tab.worker
         self._folder = gui.add_folder("Files to hand in", expand_by_default=False)
         with self._folder:
@@ -73,9 +76,13 @@ class ExportSection:
         if session is not self._shown_for:  # later refreshes leave alone what is being typed
             self._shown_for, self._written = session, ()
             set_value(self._where, str(_beside(session)))
-        names = ", ".join(path.name for path in self._written)
-        folder = self._written[0].parent if self._written else None
-        set_content(self._state, html.message(f"Written to {folder}: {names}.", level="ok") if self._written else "")
+        if not self._written:
+            set_content(self._state, "")
+            return
+        names, folder = ", ".join(path.name for path in self._written), self._written[0].parent
+        is_old = session.document is not self._written_of
+        old = html.message("The plot has changed since. Write the files again.") if is_old else ""
+        set_content(self._state, old + html.message(f"Written to {folder}: {names}.", level="ok"))
 
     def set_busy(self, busy: bool) -> None:
         """One job at a time."""
@@ -101,7 +108,7 @@ class ExportSection:
         text = self._where.value.strip().strip("\"'")
         if not text:
             raise StudioError("No folder was named.", "Type where the files should go.")
-        request, folder = self._request(), Path(text).expanduser()
+        request, folder = self._request(), _beside(session).parent / os.path.expanduser(text)  # noqa: PTH111 - may raise
         if not request.formats:
             raise StudioError("No file was chosen.", "Tick one or more.")
 
@@ -112,8 +119,8 @@ class ExportSection:
         done = functools.partial(self._done, document)
         self.tab.studio.start_work("Writing the files", work, session, done)
 
-    def _done(self, document: Any, written: tuple[Path, ...]) -> None:
-        self._written = written
+    def _done(self, document: Document, written: tuple[Path, ...]) -> None:
+        self._written, self._written_of = written, document
         self.tab.studio.exported(document)
         self.tab.worker.notify("Files written", f"{len(written)} files in {written[0].parent}.", "success")
 

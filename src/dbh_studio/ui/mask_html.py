@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from dbh_studio.io.masks import MEANING_TITLES, Review
 from dbh_studio.ui.bridge import esc, js
 from dbh_studio.ui.html import findings, message, plain
+from dbh_studio.ui.panel_words import reworded
 
 if TYPE_CHECKING:
     from dbh_studio.app.ladder import Ladder
@@ -34,7 +35,7 @@ _TITLES = {
     "brought": "Masks you bring",
     "geometry": "Geometry alone",
 }
-_OPTIONS = (
+WORDS = (
     (" (--masks)", ""),
     (" (--ignore-masks)", ""),
     (" (--images)", " in step 2"),
@@ -84,13 +85,13 @@ def ladder(found: Ladder, there: str = "") -> str:
     text = " ".join(part for part in (there, cost) if part)
     now = f'<div class="dbh-hint" data-level="ok"><b>{esc(_TAKEN[found.chosen])}</b><div>{esc(text)}</div></div>'
     higher = found.rungs[: [state.rung for state in found.rungs].index(found.chosen)]
-    lines, remedies = [], []
-    for state in higher:
+    lines = []
+    for n, state in enumerate(higher):
         why = plain(in_the_studio(state.why_not)) or "Another way was asked for."
         lines.append(f"<li><b>{esc(_TITLES[state.rung])}:</b> {esc(why)}</li>")
-        if state.remedy and state.remedy not in remedies:
-            remedies.append(state.remedy)
-    lines += [f'<li class="remedy">{_code(remedy)}</li>' for remedy in remedies]
+        # Once, below the last of those it mends.
+        if state.remedy and state.remedy not in [below.remedy for below in higher[n + 1 :]]:
+            lines.append(f'<li class="remedy">{_code(state.remedy)}</li>')
     why_not = f'<div class="muted">Why not a better way:</div><ul>{"".join(lines)}</ul>' if lines else ""
     costs = "".join(
         f"<li><b>{esc(_TITLES[state.rung])}:</b> {esc(plain(in_the_studio(state.cost_text)))}</li>"
@@ -114,9 +115,7 @@ def _code(text: str) -> str:
 
 def in_the_studio(text: str) -> str:
     """A sentence of the program with the panel's names of things in place of the command line's options."""
-    for option, name in _OPTIONS:
-        text = text.replace(option, name)
-    return text
+    return reworded(text, WORDS)
 
 
 def question(look: MaskLook) -> str:

@@ -20,7 +20,8 @@ from dbh_studio.app.plot_masks import copy_brought, masks_folder, plot_masks
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.errors import FileError, StudioError
 from dbh_studio.settings import VoteSettings
-from dbh_studio.ui.mask_html import in_the_studio
+from dbh_studio.ui.mask_html import WORDS, in_the_studio
+from dbh_studio.ui.panel_words import errors_reworded
 from dbh_studio.ui.photo_render import jpeg_url
 
 if TYPE_CHECKING:
@@ -67,12 +68,8 @@ def look_at_brought(request: MaskRequest, posed: PosedImages, *, progress: Progr
     """
     import cv2
 
-    try:
+    with errors_reworded(WORDS):
         masks = find_brought_masks(request, posed, progress=subprogress(progress, 0.0, 0.6))
-    except StudioError as error:
-        error.args = tuple(in_the_studio(part) if isinstance(part, str) else part for part in error.args)
-        error.problem, error.remedy = in_the_studio(error.problem), in_the_studio(error.remedy)
-        raise
     progress(0.7, "Drawing one of them")
     try:
         photo, picture = overlay_picture(masks, posed)
@@ -256,12 +253,15 @@ class MaskJobs:
         desk = self._studio.masks
 
         def ended(result: Any) -> None:
+            desk.forget()  # before anybody may paint: on what was there before, it would replace what was written
             desk.set_writing(False)
             done(result)
 
         def stopped(error: StudioError) -> None:
-            desk.set_writing(False)
+            if session is not self._studio.session:  # another plot is open: its masks are none of this job's business
+                return
             desk.forget()
+            desk.set_writing(False)
             failed(error)
             self._written()
 

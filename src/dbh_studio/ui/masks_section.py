@@ -184,7 +184,7 @@ class MasksSection:
             session.cameras,
             document.scale,
             len(document.trunks),
-            id(studio.masks.states()),
+            studio.masks.states(),  # itself: the number of one that is gone may come again
             request,
         )
         now = time.monotonic()

@@ -208,4 +208,4 @@ def _value(result: DbhEstimate | Refusal, name: str) -> str:
         return ""
     if not isinstance(fit, CurveFit):
         return "no fit"
-    return f"{fit.diameter(result.definition).value_cm:.1f} cm" if isinstance(result, DbhEstimate) else "shown only"
+    return f"{fit.diameter(result.definition).value_cm:.1f} cm" if isinstance(result, DbhEstimate) else "–"

@@ -176,7 +176,8 @@ class Tab:
     def _trunks_appeared(self) -> None:
         """The first trunks of a plot: show them, to be looked through."""
         self._show_in_red()
-        self.view.step = "inspect"
+        if not self.masks.mode:  # nobody is taken away from what they paint
+            self.view.step = "inspect"
         self.refresh()
 
     def _show_in_red(self) -> None:

@@ -109,7 +109,7 @@ def _histogram(misfits_cm: Float64) -> str:
     side = "end" if at > 0.6 * _SIZE else "start"
     shift = -5 if side == "end" else 5
     return (
-        f'<svg class="dbh-section" viewBox="0 0 {_SIZE} {_BARS_HEIGHT}" role="img" aria-label="Misfit of the poses">'
+        f'<svg class="dbh-profile" viewBox="0 0 {_SIZE} {_BARS_HEIGHT}" role="img" aria-label="Misfit of the poses">'
         f'{bars}<path d="M{at:.1f} 0V{tall}" stroke="#343a40" stroke-width="1.5"/>'
         f'<text x="{at + shift:.1f}" y="14" font-size="14" font-family="sans-serif" text-anchor="{side}">median '
         f"{median:.1f}</text>"
@@ -122,11 +122,11 @@ def _histogram(misfits_cm: Float64) -> str:
 def trees_html(trees: Sequence[TreeComparison]) -> str:
     """The two diameters side by side; a click on a row chooses the tree."""
     rows = "".join(_row(tree) for tree in trees)
-    heads = "".join(f"<th>{text}</th>" for text in ("Tree", "Photo cm", "LiDAR cm", "Diff. cm", "%", "Apart cm"))
+    heads = "".join(f"<th>{text}</th>" for text in ("Tree", "Photo", "LiDAR", "Diff.", "%", "Apart"))
     return (
-        '<div class="dbh"><div class="muted">Click a row to see the tree.</div>'
-        f'<div class="dbh-scroll" tabindex="0"><table class="dbh-table"><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div></div>"
+        '<div class="dbh"><div class="muted">Centimetres; click a row to see the tree.</div>'
+        '<div class="dbh-scroll" tabindex="0"><table class="dbh-table" data-columns="even">'
+        f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div></div>"
     )
 
 

@@ -97,11 +97,12 @@ class TransferSection:
             set_disabled(button, busy)
 
     def _start_pressed(self) -> None:
-        from dbh_studio.app.transfer_plot import apply_scale, check_outputs, photo_side, transfer_plot
+        from dbh_studio.app.transfer_plot import apply_scale, photo_side
+        from dbh_studio.ui.transfer_job import check_before, transfer
 
         session, studio = self.tab.require_session(), self.tab.studio
         request = self._request(session)
-        check_outputs(request)
+        check_before(request)
 
         def done(report: TransferReport) -> None:
             if request.set_scale and not session.is_read_only:
@@ -110,7 +111,7 @@ class TransferSection:
             studio.refresh_tabs()
 
         studio.start_job(
-            "Carrying the trunks over", transfer_plot, (*photo_side(session), request), session, done,
+            "Carrying the trunks over", transfer, (*photo_side(session), request), session, done,
             failed=lambda _: studio.measure_missing(),
         )  # fmt: skip
 
