@@ -38,14 +38,13 @@ from dbh_studio.app.session import Session  # noqa: E402
 from dbh_studio.core.scale import ScaleEstimate  # noqa: E402
 from dbh_studio.core.synthetic import PlotRecipe, make_plot  # noqa: E402
 from dbh_studio.core.trunks import Trunk, TrunkSet  # noqa: E402
-from dbh_studio.ui.scene import COLOUR_MODES  # noqa: E402
 from dbh_studio.ui.server import start_server  # noqa: E402
 from dbh_studio.ui.studio import Studio  # noqa: E402
 
 CLICK_S, COLOURS_S = 0.3, 0.2
 LONG_S = 300.0
-# The studio begins with red trunks: every step is a change.
-_MODES = [*COLOUR_MODES[2:], *COLOUR_MODES[:2]] * 6
+# Those that every plot has. The studio begins with red trunks: every step is a change.
+_MODES = ["Segmentation (by tree)", "Height", "Original", "Segmentation (red)"] * 6
 _NO_DRAWING = """
 const draw = WebGL2RenderingContext.prototype.drawArrays;
 WebGL2RenderingContext.prototype.drawArrays = function (mode, first, count) {

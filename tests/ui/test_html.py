@@ -55,7 +55,7 @@ def test_the_card_shows_the_number_and_where_it_was_measured(estimate):
     card = html.tree_card(7, estimate)
     assert "Tree 7" in card
     assert 'data-dbh="30.0"' in card
-    assert "1.22–1.52 m" in card
+    assert "1.22 to 1.52 m" in card
 
 
 def test_a_refused_tree_shows_reason_and_remedy_and_no_number():

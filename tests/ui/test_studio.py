@@ -416,10 +416,10 @@ def test_what_is_no_curve_changes_nothing(measured, studio, payload):
 def test_breast_height_of_another_country_takes_effect_at_once(measured, studio):
     trunk_id = table_ids(measured)[0]
     measured.bridge_send("row", trunk_id)
-    measured.wait_text("1.30 m; shown")
+    measured.wait_text("the stretch from 1.15")
     assert measured.value("Breast height") == "1.30 m (Europe, Canada)"
     measured.set("Breast height", "1.37 m (USA)")
-    measured.wait_text("1.37 m; shown", LONG)
+    measured.wait_text("the stretch from 1.22", LONG)
     assert studio.session.document.settings.measure.breast_height_m == 1.37
     measured.bridge_send("undo")
     measured.wait(lambda t: t.value("Breast height") == "1.30 m (Europe, Canada)", LONG)

@@ -210,30 +210,37 @@ def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "",
         f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><div class="dbh-number">'
         f'{title}<b>{result.dbh_cm:.1f}</b><small title="{tip}">cm{interval}</small>'
         f'<span class="dbh-badge" data-quality="{esc(result.quality)}">{esc(result.quality)}</span></div>'
-        f"{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(_card_facts(result, scale))}</div>"
+        f"{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(_card_facts(result))}"
+        f"<details><summary>How it was measured</summary>{facts(_measuring_facts(result, scale))}</details></div>"
     )
 
 
-def _card_facts(result: DbhEstimate, scale: str) -> list[tuple[str, str]]:
-    """How a diameter was measured, and what else is known of the stem."""
-    cut, diameters = result.section, result.diameters
-    low, high = cut.band_m
-    others = [f"{DEFINITION_TITLES[name]} {_with_range(diameters[name])}" for name in diameters]
-    girth = diameters["tape"]
+def _card_facts(result: DbhEstimate) -> list[tuple[str, str]]:
+    """What one compares with the tree in the forest."""
+    cut, girth = result.section, result.diameters["tape"]
     round_cm = [np.pi * value for value in (girth.value_cm, girth.low_cm, girth.high_cm) if value is not None]
     pairs = [
-        ("Measured at", f"{cut.hom_m:.2f} m; shown: {low:.2f}–{high:.2f} m"),
-        ("Read from", f"{CURVE_TITLES.get(result.curve, result.curve)}, {_definition(result)}"),
-        ("Interval", f"90 %{scale}" if result.interval else "none: this method has none that is honest"),
+        ("Measured at", f"{cut.hom_m:.2f} m"),
         ("Tape round it", _in_brackets(round_cm) + " cm"),
-        ("By definition", ", ".join(others)),
         ("Ring seen", f"{cut.coverage_deg:.0f}°, largest gap {cut.max_gap_deg:.0f}°"),
-        ("Scatter", f"{result.rmse_mm:.1f} mm about the curve, {result.n_points:,} points"),
         ("Lean", f"{cut.lean_deg:.0f}°"),
     ]
     if result.taper_cm_per_m is not None:
         pairs.append(("Taper", f"{result.taper_cm_per_m:.1f} cm per metre"))
     return pairs
+
+
+def _measuring_facts(result: DbhEstimate, scale: str) -> list[tuple[str, str]]:
+    """How the diameter was read, and what it would be by another definition."""
+    low, high = result.section.band_m
+    others = [f"{DEFINITION_TITLES[name]} {_with_range(diameter)}" for name, diameter in result.diameters.items()]
+    return [
+        ("Read from", f"{CURVE_TITLES.get(result.curve, result.curve)}, {_definition(result)}"),
+        ("Interval", f"90 %{scale}" if result.interval else "none: this method has none that is honest"),
+        ("By definition", ", ".join(others)),
+        ("Scatter", f"{result.rmse_mm:.1f} mm about the curve, {result.n_points:,} points"),
+        ("Shown", f"the stretch from {low:.2f} to {high:.2f} m"),
+    ]
 
 
 def scale_words(scale: ScaleEstimate) -> str:

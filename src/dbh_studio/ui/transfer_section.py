@@ -73,6 +73,8 @@ class TransferSection:
             return
         if session is not self._shown_for:  # later refreshes leave alone what is being typed
             self._shown_for = session
+            for handle in (self._lidar, self._scanner, self._camera, self._rate, self._out):
+                set_value(handle, "")  # they spoke of the plot before
             set_value(self._set_scale, not session.document.scale.is_known)
             set_value(self._replace, False)
         document, report = _reports.get(session, (None, None))
