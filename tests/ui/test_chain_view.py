@@ -56,6 +56,7 @@ def test_the_mode_is_offered_once_there_is_a_search(studio, tmp_path):
     studio.adopt(session)
     with FakeClient(studio.server.url) as tab:
         tab.wait(lambda t: "/labels" in t.scene, LONG)
+        tab.settle()  # the plot is shown: a step chosen before would be overtaken
         tab.bridge_send("step", "trunks")
         tab.wait(lambda t: t.has("Find trunks"))
         assert "Where trees were lost" not in tab.text()
@@ -174,6 +175,7 @@ def test_a_reopened_plot_shows_its_steps(searched, studio, tmp_path):
     studio.adopt(open_plot(folder))
     with FakeClient(studio.server.url) as tab:
         tab.wait(lambda t: "/labels" in t.scene, LONG)
+        tab.settle()  # the plot is shown: a step chosen before would be overtaken
         tab.bridge_send("step", "trunks")
         tab.wait_text("Where trees were lost")
         assert steps_of(studio).counts == counts

@@ -62,6 +62,7 @@ def masked(studio, files, tmp_path):
 
 def go_to_trunks(client):
     client.wait(lambda t: "/cameras" in t.scene, LONG)
+    client.settle()
     client.bridge_send("step", "trunks")
     client.wait_text("Masks of the photos", LONG)
 
@@ -138,6 +139,7 @@ def test_a_plot_without_photos_says_what_photos_would_bring(studio, files, tmp_p
 
     studio.adopt(open_plot(files.cloud, project_dir=tmp_path / "alone.dbh", scale=1.0))
     with FakeClient(studio.server.url) as client:
+        client.settle()  # the plot is shown: a step chosen before would be overtaken
         client.bridge_send("step", "trunks")
         client.wait_text("add photos in step 2", LONG)
         assert not client.has("Look at them") and not client.has("Find trunks from the masks")

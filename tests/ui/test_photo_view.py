@@ -74,6 +74,7 @@ def add_photos(session, folder):
 
 def go_to_scale(client):
     client.wait_text("Data check", LONG)
+    client.settle()
     client.bridge_send("step", "scale")
     client.bridge_send("scale-way", "markers")
 

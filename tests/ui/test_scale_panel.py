@@ -31,6 +31,7 @@ def tab(studio, session):
     studio.adopt(session)
     with FakeClient(studio.server.url) as client:
         client.wait(lambda t: t.has("Find markers in the photos") or "Data check" in t.text(), LONG)
+        client.settle()  # the plot is shown: a step chosen before would be overtaken
         client.bridge_send("step", "scale")
         client.wait(lambda t: t.has("Find markers in the photos"), LONG)
         client.wait(lambda t: "/cameras" in t.scene, LONG)
@@ -586,6 +587,7 @@ def bare(studio, tmp_path):
     studio.adopt(session)
     with FakeClient(studio.server.url) as client:
         client.wait_text("no scale yet", LONG)
+        client.settle()  # the plot is shown: a step chosen before would be overtaken
         client.bridge_send("step", "scale")
         client.wait_text("Mark a bar")
         yield client.settle(), session

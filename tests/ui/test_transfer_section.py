@@ -35,6 +35,7 @@ def show(studio, session):
     studio.adopt(session)
     client = FakeClient(studio.server.url)
     client.wait(lambda t: session.document.plot_id in t.text(), LONG)
+    client.settle()  # the plot is shown: a step chosen before would be overtaken
     client.bridge_send("step", "export")
     client.wait(lambda t: t.has(START), LONG)
     return client
@@ -75,6 +76,7 @@ def test_trunks_are_carried_compared_and_the_lidar_plot_is_opened(studio, tab, f
     assert studio.session.document.scale.source == "factor", "the photo plot is as it was"
     # Another tab shows it too.
     with FakeClient(studio.server.url) as other:
+        other.settle()  # the plot is shown: a step chosen before would be overtaken
         other.bridge_send("step", "export")
         other.wait(lambda t: "data-carried=" in t.html(), LONG)
     assert studio.wait_idle(LONG)
