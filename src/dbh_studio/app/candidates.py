@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 from dbh_studio.app.commands import Command
 from dbh_studio.app.document import Document
 from dbh_studio.app.edits import LEAST_POINTS, add_trunk
+from dbh_studio.app.kept import read_kept
 from dbh_studio.core.candidates import CandidateKind, CandidateTrunk
 from dbh_studio.core.inventory import TreeRecord
 from dbh_studio.errors import CommandError
@@ -217,24 +217,14 @@ def keep_offers(folder: Path, session: Session) -> None:
 
 def kept_offers(folder: Path, document: Document) -> Offers | None:
     """What `keep_offers` wrote for the same cloud; None where there is nothing that can be used."""
-    path = folder / _FILE
-    if not path.is_file():
-        return None
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
-            about = json.loads(str(saved["about"]))
-            named = (about["version"], about["fingerprint"], about["n_points"])
-            if named != (_VERSION, document.source.fingerprint, document.source.n_points):
-                return None
-            points, ends = saved["points"].astype(np.int32), saved["ends"].astype(np.int64)
-            return _offers_from(about, np.split(points, ends[:-1]) if len(ends) else [])
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        log.warning("The candidates for trunks cannot be used: %s", error)
-        return None
+    what = "The candidates for trunks"
+    return read_kept(folder / _FILE, document, _offers_from, version=_VERSION, what=what)
 
 
-def _offers_from(about: dict[str, Any], point_sets: Sequence[Any]) -> Offers:
+def _offers_from(about: dict[str, Any], saved: Mapping[str, Any]) -> Offers:
     """Raises what comes of a file that is not as `keep_offers` made it."""
+    points, ends = saved["points"].astype(np.int32), saved["ends"].astype(np.int64)
+    point_sets = np.split(points, ends[:-1]) if len(ends) else []
     candidates = []
     for points, row in zip(point_sets, about["candidates"], strict=True):
         x, y, diameter, kind, reason, n_seen, n_called = row

@@ -223,7 +223,7 @@ def delete_trunk(trunk_id: int) -> Command:
     """Take one trunk away. Its id is not given out again."""
 
     def apply(document: Document) -> Document:
-        _existing(document, trunk_id)
+        existing_trunk(document, trunk_id)
         trees = {i: record for i, record in document.trees.items() if i != trunk_id}
         return replace(document, trunks=document.trunks.without(trunk_id), trees=trees)
 
@@ -234,7 +234,7 @@ def restore_trunk(earlier: Document, trunk_id: int) -> Command:
     """Bring one trunk back as it was in an earlier Document, with what was said about it."""
 
     def apply(document: Document) -> Document:
-        trunk = _existing(earlier, trunk_id)
+        trunk = existing_trunk(earlier, trunk_id)
         if earlier.source.fingerprint != document.source.fingerprint:
             raise CommandError(f"Trunk {trunk_id} belongs to another cloud.")
         if trunk_id in document.trunks:
@@ -252,7 +252,7 @@ def set_tree_record(trunk_id: int, **values: Any) -> Command:
     """Say something about a stem: `species`, `status`, `note`, `tag`, `tree_id` or `edited`."""
 
     def apply(document: Document) -> Document:
-        _existing(document, trunk_id)
+        existing_trunk(document, trunk_id)
         before = document.record(trunk_id)
         try:
             after = replace(before, **values)
@@ -295,9 +295,14 @@ def _check_length(length: ScaleBar | MarkerSquare) -> None:
         )
 
 
-def _existing(document: Document, trunk_id: int) -> Trunk:
+def existing_trunk(document: Document, trunk_id: int) -> Trunk:
+    """The trunk of that number.
+
+    Raises:
+        CommandError: There is none.
+    """
     if trunk_id not in document.trunks:
-        raise CommandError(f"There is no trunk {trunk_id}.")
+        raise CommandError(f"There is no trunk {trunk_id}.", "It may have been merged or deleted: see Undo.")
     return document.trunks[trunk_id]
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dbh_studio.app.commands import Command
+from dbh_studio.app.commands import Command, existing_trunk
 from dbh_studio.app.document import Document
 from dbh_studio.app.edits import add_trunk, assign_points, keep_only, split_trunk
 from dbh_studio.app.session import Session
@@ -82,7 +82,7 @@ def split_by_plane(session: Session, trunk_id: int, through_world: Any, normal_w
         CommandError: There is no such trunk.
     """
     document = session.document
-    trunk = _existing(document, trunk_id)
+    trunk = existing_trunk(document, trunk_id)
     beyond = beyond_plane(session.points_world(document)[trunk.points], through_world, normal_world)
     return split_trunk(trunk_id, [trunk.points[beyond], trunk.points[~beyond]])
 
@@ -97,7 +97,7 @@ def split_by_stems(session: Session, trunk_id: int) -> Command:
     from dbh_studio.stages.stem_edits import part_stems
 
     document = session.document
-    trunk = _existing(document, trunk_id)
+    trunk = existing_trunk(document, trunk_id)
     session.require_scale(document)
     labels = part_stems(
         session.points_world(document)[trunk.points],
@@ -140,7 +140,7 @@ def add_by_click(session: Session, seed_world: Any) -> tuple[Command, str]:
 def grow_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) -> Command:
     """Let the free points within a distance of a trunk join it."""
     document = session.document
-    trunk = _existing(document, trunk_id)
+    trunk = existing_trunk(document, trunk_id)
     points = session.points_world(document)
     near = _near(points, trunk, distance_m)
     free = near[~_owned(document)[near]]
@@ -154,7 +154,7 @@ def shrink_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) ->
         CommandError: Nothing of it would be left.
     """
     document = session.document
-    trunk = _existing(document, trunk_id)
+    trunk = existing_trunk(document, trunk_id)
     points = session.points_world(document)
     others = np.setdiff1d(_near(points, trunk, distance_m), trunk.points, assume_unique=True)
     left = shrunk(points, trunk.points, others, distance_m)
@@ -163,19 +163,13 @@ def shrink_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) ->
     return keep_only(left, trunk_id)
 
 
-def _existing(document: Document, trunk_id: int) -> Trunk:
-    if trunk_id not in document.trunks:
-        raise CommandError(f"There is no trunk {trunk_id}.", "It may have been merged or deleted: see Undo.")
-    return document.trunks[trunk_id]
-
-
 def _looked_at(session: Session, within: Iterable[int] | None) -> tuple[Float32, Int64 | None]:
     """The points to select among, and their rows in the cloud; None where these are all of it."""
     document = session.document
     points = session.points_world(document)
     if within is None:
         return points, None
-    own = [_existing(document, trunk_id).points for trunk_id in sorted(set(within))]
+    own = [existing_trunk(document, trunk_id).points for trunk_id in sorted(set(within))]
     rows = np.sort(np.concatenate([*own, np.empty(0, np.int32)])).astype(np.int64)
     return points[rows], rows
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.app.commands import Command
+from dbh_studio.app.commands import Command, existing_trunk
 from dbh_studio.app.document import Document
 from dbh_studio.core.arrays import Int32
 from dbh_studio.core.inventory import TreeRecord
@@ -38,7 +38,7 @@ def merge_trunks(ids: Iterable[int], into: int | None = None) -> Command:
         kept = wanted[0] if into is None and wanted else into
         if len(wanted) < 2 or kept not in wanted:
             raise CommandError("Two or more trunks are needed to merge.", "Choose the trunks that are one stem.")
-        trunks = [_existing(document, trunk_id) for trunk_id in wanted]
+        trunks = [existing_trunk(document, trunk_id) for trunk_id in wanted]
         target = document.trunks[kept]
         points = np.unique(np.concatenate([trunk.points for trunk in trunks]))
         after = document.trunks
@@ -62,7 +62,7 @@ def split_trunk(trunk_id: int, parts: Sequence[NDArray[Any]]) -> Command:
     pieces = [np.unique(np.asarray(part, np.int32)) for part in parts]
 
     def apply(document: Document) -> Document:
-        trunk = _existing(document, trunk_id)
+        trunk = existing_trunk(document, trunk_id)
         together = np.concatenate(pieces) if pieces else np.empty(0, np.int32)
         if len(np.unique(together)) != len(together) or not np.isin(together, trunk.points).all():
             raise CommandError(
@@ -117,7 +117,7 @@ def assign_points(points: NDArray[Any], trunk_id: int) -> Command:
     """Give points to a trunk, whosever they are. A trunk that loses all of its points is gone."""
 
     def apply(document: Document) -> Document:
-        target = _existing(document, trunk_id)
+        target = existing_trunk(document, trunk_id)
         chosen = _inside(document, points)
         taken = owners(document.trunks, chosen, document.source.n_points)
         if len(taken.pop(trunk_id, ())) == len(chosen):
@@ -135,7 +135,7 @@ def drop_points(points: NDArray[Any], trunk_id: int | None = None) -> Command:
 
     def apply(document: Document) -> Document:
         if trunk_id is not None:
-            _existing(document, trunk_id)
+            existing_trunk(document, trunk_id)
         chosen = _inside(document, points)
         taken = owners(document.trunks, chosen, document.source.n_points)
         if trunk_id is not None:
@@ -153,7 +153,7 @@ def keep_only(points: NDArray[Any], trunk_id: int) -> Command:
     """Take off a trunk what is not among the given points."""
 
     def apply(document: Document) -> Document:
-        trunk = _existing(document, trunk_id)
+        trunk = existing_trunk(document, trunk_id)
         off = np.setdiff1d(trunk.points, np.asarray(points, np.int32))
         return drop_points(off, trunk_id).apply(document) if len(off) else document
 
@@ -167,7 +167,7 @@ def delete_trunks(ids: Iterable[int]) -> Command:
     def apply(document: Document) -> Document:
         after = document.trunks
         for trunk_id in wanted:
-            _existing(document, trunk_id)
+            existing_trunk(document, trunk_id)
             after = after.without(trunk_id)
         return document if not wanted else _with(document, after, {})
 
@@ -178,7 +178,7 @@ def renumber_trunk(trunk_id: int, new_id: int) -> Command:
     """Give a trunk another number, which must be free."""
 
     def apply(document: Document) -> Document:
-        trunk = _existing(document, trunk_id)
+        trunk = existing_trunk(document, trunk_id)
         if new_id == trunk_id:
             return document
         if new_id in document.trunks:
@@ -206,7 +206,7 @@ def group_stems(ids: Iterable[int]) -> Command:
         if len(wanted) < 2:
             raise CommandError("Two or more stems make a multi-stem tree.", "Choose its stems.")
         for trunk_id in wanted:
-            _existing(document, trunk_id)
+            existing_trunk(document, trunk_id)
         records = {i: replace(document.record(i), tree_id=wanted[0]) for i in wanted}
         if all(document.record(i) == record for i, record in records.items()):
             return document
@@ -221,7 +221,7 @@ def ungroup_stems(ids: Iterable[int]) -> Command:
 
     def apply(document: Document) -> Document:
         for trunk_id in wanted:
-            _existing(document, trunk_id)
+            existing_trunk(document, trunk_id)
         records = {
             i: replace(document.record(i), tree_id=None) for i in wanted if document.record(i).tree_id is not None
         }
@@ -266,12 +266,6 @@ def _filled_up(records: Sequence[TreeRecord]) -> TreeRecord:
             values[name] = next((getattr(each, name) for each in others if getattr(each, name)), getattr(first, name))
     notes = dict.fromkeys(each.note for each in records if each.note)
     return replace(first, **values, note="; ".join(notes))
-
-
-def _existing(document: Document, trunk_id: int) -> Trunk:
-    if trunk_id not in document.trunks:
-        raise CommandError(f"There is no trunk {trunk_id}.", "It may have been merged or deleted: see Undo.")
-    return document.trunks[trunk_id]
 
 
 def _inside(document: Document, points: NDArray[Any]) -> Int32:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
@@ -15,9 +14,10 @@ import numpy as np
 
 from dbh_studio.app.commands import Command
 from dbh_studio.app.document import Document
+from dbh_studio.app.kept import read_kept
 from dbh_studio.core.arrays import UInt8, readonly
 from dbh_studio.core.chain_steps import ChainSteps, Cluster, NearMiss, Step
-from dbh_studio.errors import SettingError, StudioError
+from dbh_studio.errors import StudioError
 from dbh_studio.io.atomic import atomic_file
 from dbh_studio.settings import GroundSettings, TrunkSettings
 
@@ -128,19 +128,8 @@ def keep_search(folder: Path, session: Session) -> None:
 
 def kept_search(folder: Path, document: Document) -> LastSearch | None:
     """What `keep_search` wrote for the same cloud; None where there is nothing that can be used."""
-    path = folder / _FILE
-    if not path.is_file():
-        return None
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
-            about = json.loads(str(saved["about"]))
-            named = (about["version"], about["fingerprint"], about["n_points"])
-            if named != (_VERSION, document.source.fingerprint, document.source.n_points):
-                return None
-            return _search_from(about, saved)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, SettingError, zipfile.BadZipFile) as error:
-        log.warning("The steps of the last search for trunks cannot be used: %s", error)
-        return None
+    what = "The steps of the last search for trunks"
+    return read_kept(folder / _FILE, document, _search_from, version=_VERSION, what=what)
 
 
 _ROWS: dict[str, type[Cluster] | type[NearMiss]] = {"clusters": Cluster, "near_misses": NearMiss}

@@ -54,8 +54,8 @@ def lay_plots(
 ) -> Laid:
     """Lay a photo plot on a LiDAR plot.
 
-    A photo plot without a scale gets the LiDAR's in this session, and one without trunks gets trunks: the stems cannot
-    be compared without.
+    A photo plot without a scale gets the LiDAR's in memory, and one without trunks gets trunks: the stems cannot be
+    compared without. What is saved of it stays as it is.
 
     Raises:
         AlignmentError: It cannot be done; says why and what helps.
