@@ -359,7 +359,7 @@ def test_save_as_leaves_the_old_plot_and_does_not_overwrite(las, tmp_path):
     session = open_plot(las)
     with pytest.raises(ProjectError, match="already"):
         save_as(session, tmp_path / "b.dbh")
-    assert json.loads((tmp_path / "b.dbh" / "project.json").read_text())["schema_version"] == 2
+    assert json.loads((tmp_path / "b.dbh" / "project.json").read_text())["schema_version"] == 3
 
 
 @pytest.mark.parametrize(

@@ -157,5 +157,5 @@ def test_columns_are_a_promise():
         "dbh_tape_cm,dbh_tape_lo_cm,dbh_tape_hi_cm,dbh_curve_cm,dbh_curve_lo_cm,dbh_curve_hi_cm,"
         "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,hom_m,coverage_deg,max_gap_deg,"
         "rmse_mm,n_points,lean_deg,taper_cm_per_m,quality,flags,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,note,"
-        "easting,northing,epsg"
+        "health,crown_class,field_tape_cm,field_tape_height_m,corrections,review,easting,northing,epsg"
     )

@@ -61,6 +61,12 @@ MEASURED = InventoryRow(
     scale_source="marker",
     scale_err_pct=0.15,
     note='low fork, "twin"',
+    health="thin crown",
+    crown_class="dominant",
+    field_tape_cm=31.9,
+    field_tape_height_m=1.3,
+    corrections="curve;ground",
+    review="accepted",
     easting=500001.5,
     northing=4499997.75,
     epsg=32633,
@@ -103,6 +109,12 @@ REFUSED = replace(
     z_ground_m=None,
     scale_err_pct=None,
     note="",
+    health="",
+    crown_class="",
+    field_tape_cm=None,
+    field_tape_height_m=None,
+    corrections="",
+    review="",
     easting=None,
     northing=None,
     epsg=None,
@@ -113,12 +125,12 @@ GOLDEN = (
     "dbh_tape_cm,dbh_tape_lo_cm,dbh_tape_hi_cm,dbh_curve_cm,dbh_curve_lo_cm,dbh_curve_hi_cm,"
     "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,hom_m,coverage_deg,max_gap_deg,rmse_mm,"
     "n_points,lean_deg,taper_cm_per_m,quality,flags,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,"
-    "note,easting,northing,epsg\n"
+    "note,health,crown_class,field_tape_cm,field_tape_height_m,corrections,review,easting,northing,epsg\n"
     "Stand 4,1,1,A-7,live,Fagus sylvatica,31.42,30.20,32.65,shrinkage,curve,31.70,30.50,32.96,31.42,30.20,32.65,"
     "31.30,30.10,32.50,1.370,300.0,60.0,4.2,812,3.1,1.23,good,,,,false,1.500,-2.250,"
-    '0.000,marker,0.150,"low fork, ""twin""",500001.500,4499997.750,32633\n'
+    '0.000,marker,0.150,"low fork, ""twin""",thin crown,dominant,31.90,1.300,curve;ground,accepted,500001.500,4499997.750,32633\n'
     "Stand 4,2,2,'=HYPERLINK(1),,Weißtanne,,,,,,,,,,,,,,,,,,,4,,,refused,too_few_points,Only 4 points at 1.3 m.,"
-    "Walk closer.,true,,,,marker,,,,,\n"
+    "Walk closer.,true,,,,marker,,,,,,,,,,,\n"
 ).encode()
 
 

@@ -23,7 +23,7 @@ from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectLockedError, ProjectVersionError
 from dbh_studio.io import project
-from dbh_studio.io.project import PlotState, ProjectWriter, is_project, read_project
+from dbh_studio.io.project import HistoryEntry, PlotState, ProjectWriter, is_project, read_project
 from dbh_studio.settings import Settings
 
 REPOSITORY = Path(__file__).parents[2]
@@ -391,7 +391,7 @@ def test_a_damaged_plot_is_named_and_left_as_it_is(tmp_path, damage, words):
 
 def test_a_plot_of_a_newer_program_says_to_update(tmp_path):
     written(tmp_path / "plot.dbh", make_state(tmp_path))
-    _edited(schema_version=3, trunks="in a new way")(tmp_path / "plot.dbh")
+    _edited(schema_version=4, trunks="in a new way")(tmp_path / "plot.dbh")
     with pytest.raises(ProjectVersionError, match="newer") as caught:
         read_project(tmp_path / "plot.dbh")
     assert "Update" in caught.value.remedy
@@ -424,7 +424,7 @@ def test_schema_1_is_read_for_ever(tmp_path):
     assert state.source_path == Path("/nowhere/plot.ply") and state.masks is None
     # Saved again, it is a plot of today, with all that it was.
     written(folder, state)
-    assert json.loads((folder / "project.json").read_text())["schema_version"] == 2
+    assert json.loads((folder / "project.json").read_text())["schema_version"] == 3
     assert same(read_project(folder), state)
 
 
@@ -496,7 +496,7 @@ def test_a_link_or_pipe_in_a_plot_somebody_sent_is_refused_and_what_it_leads_to_
     def use() -> None:
         writer = ProjectWriter(folder)
         try:
-            writer.log([{"what": "edit"}])
+            writer.log([HistoryEntry("", "", "edit")])
         finally:
             writer.close()
 
@@ -518,7 +518,7 @@ def test_the_history_of_a_replaced_plot_is_put_aside(tmp_path):
     writer = ProjectWriter(folder)
     writer.put_history_aside()
     for number in range(3):
-        writer.log([{"what": str(number)}])
+        writer.log([HistoryEntry("", "", str(number))])
         writer.put_history_aside()
     writer.close()
     assert not (folder / "history.jsonl").exists()
@@ -529,11 +529,11 @@ def test_the_history_of_a_replaced_plot_is_put_aside(tmp_path):
 def test_the_history_is_appended_line_by_line_also_after_a_line_was_cut_off(tmp_path):
     folder = tmp_path / "plot.dbh"
     writer = ProjectWriter(folder)
-    writer.log([{"what": "Größe"}, {"what": "two\nlines"}])
+    writer.log([HistoryEntry("", "", "Größe"), HistoryEntry("", "", "two\nlines")])
     writer.log([])
     with (folder / "history.jsonl").open("ab") as file:
         file.write(b'{"what": "cut o')
-    writer.log([{"what": "after"}])
+    writer.log([HistoryEntry("", "", "after")])
     writer.close()
     lines = (folder / "history.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["what"] for line in (lines[0], lines[1], lines[3])] == ["Größe", "two\nlines", "after"]

@@ -16,7 +16,7 @@ from typing import Literal
 from dbh_studio.app.document import CameraSource, Document, SourceInfo
 from dbh_studio.app.session import Change, Session
 from dbh_studio.errors import ProjectError
-from dbh_studio.io.project import CameraPlace, PlotState, ProjectWriter
+from dbh_studio.io.project import CameraPlace, HistoryEntry, PlotState, ProjectWriter
 
 _log = logging.getLogger(__name__)
 
@@ -102,10 +102,10 @@ class Autosave:
     ) -> None:
         self._session = session
         self._writer = writer
-        self._author = _user() if author is None else author
+        self._author = user_name() if author is None else author
         self._condition = threading.Condition()
         self._saving = threading.Lock()
-        self._entries: list[dict[str, str]] = []
+        self._entries: list[HistoryEntry] = []
         self._has_news = self._is_closing = False
         # The Document on disk, by identity; None where there is none yet.
         self._saved: Document | None = None if is_new else session.document
@@ -122,6 +122,11 @@ class Autosave:
         if background:
             self._thread = threading.Thread(target=self._run, name="autosave", daemon=True)
             self._thread.start()
+
+    @property
+    def author(self) -> str:
+        """Whom the history names."""
+        return self._author
 
     @property
     def folder(self) -> Path:
@@ -208,7 +213,7 @@ class Autosave:
             else:
                 self._set_status(SaveStatus("saved"))
 
-    def _keep_entries(self, entries: list[dict[str, str]], problem: str) -> None:
+    def _keep_entries(self, entries: list[HistoryEntry], problem: str) -> None:
         """Keep what the history lacks, so that the next call saves."""
         with self._condition:
             self._entries = entries + self._entries
@@ -224,11 +229,12 @@ class Autosave:
             except Exception:  # noqa: BLE001 - the others must hear of it
                 _log.exception("A listener of the save status failed")
 
-    def _entry(self, label: str) -> dict[str, str]:
-        return {"when": datetime.now(timezone.utc).isoformat(timespec="seconds"), "who": self._author, "what": label}
+    def _entry(self, label: str) -> HistoryEntry:
+        return HistoryEntry(datetime.now(timezone.utc).isoformat(timespec="seconds"), self._author, label)
 
 
-def _user() -> str:
+def user_name() -> str:
+    """Who is signed in to the system; empty where that cannot be told."""
     # Which of these it raises where there is no such user depends on the version of Python.
     with contextlib.suppress(OSError, KeyError, ImportError):
         return getpass.getuser()

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from dbh_studio.app.document import CameraSource, Direction, Document, unit_direction
 from dbh_studio.core.arrays import Int32
-from dbh_studio.core.inventory import TreeRecord, check_text
+from dbh_studio.core.corrections import Correction, CorrectionKind, with_correction, without_correction
 from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.scale_evidence import MarkerSquare, ScaleBar, ScaleEvidence
+from dbh_studio.core.tree_record import Review, TreeRecord, check_text
 from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
 from dbh_studio.errors import CommandError, SettingError
 
@@ -27,6 +28,18 @@ from dbh_studio.errors import CommandError, SettingError
 _SAME_TRUNK_IOU = 0.5
 # Of a known length, metres.
 _SHORTEST_M, _LONGEST_M = 0.001, 10_000.0
+_CORRECTED: dict[CorrectionKind, str] = {
+    "breast_height": "breast height",
+    "base": "base",
+    "along": "way of measuring height",
+    "above": "place of measurement",
+    "ground": "ground",
+    "curve": "curve",
+    "left_out": "points",
+    "ring": "ring",
+    "tape": "tape value",
+    "tape_height": "tape height",
+}
 
 
 @dataclass(frozen=True)
@@ -249,23 +262,92 @@ def restore_trunk(earlier: Document, trunk_id: int) -> Command:
 
 
 def set_tree_record(trunk_id: int, **values: Any) -> Command:
-    """Say something about a stem: `species`, `status`, `note`, `tag`, `tree_id` or `edited`."""
+    """Say something about a stem: `species`, `status`, `note`, `tag`, `tree_id` or another field of `TreeRecord`."""
+    return describe_trees([trunk_id], **values)
+
+
+def describe_trees(ids: Iterable[int], **values: Any) -> Command:
+    """Say the same about several stems, in one step."""
+    wanted = sorted(set(ids))
+
+    def apply(document: Document) -> Document:
+        return with_records(document, {i: _described(document, i, values) for i in wanted})
+
+    names = f"trunk {wanted[0]}" if len(wanted) == 1 else f"{len(wanted)} trunks"
+    return Command(f"Describe {names}", apply)
+
+
+def set_tree_fields(ids: Iterable[int], **values: str) -> Command:
+    """Fill fields of one's own, by name, of several stems; an empty text clears the field, others stay."""
+    wanted = sorted(set(ids))
+
+    def apply(document: Document) -> Document:
+        records = {}
+        for i in wanted:
+            existing_trunk(document, i)
+            records[i] = _described(document, i, {"fields": dict(document.record(i).fields) | values})
+        return with_records(document, records)
+
+    names = f"trunk {wanted[0]}" if len(wanted) == 1 else f"{len(wanted)} trunks"
+    return Command(f"Describe {names}", apply)
+
+
+def correct_measurement(trunk_id: int, correction: Correction) -> Command:
+    """Measure one stem otherwise than the plot, in place of an earlier correction of the kind."""
 
     def apply(document: Document) -> Document:
         existing_trunk(document, trunk_id)
-        before = document.record(trunk_id)
-        try:
-            after = replace(before, **values)
-        except (TypeError, ValueError) as error:
-            raise CommandError(f"This cannot be said about trunk {trunk_id}: {error}.") from None
-        if after == before:
+        record = document.record(trunk_id)
+        if correction.kind == "left_out" and correction.value[-1] >= document.source.n_points:
+            raise CommandError("Points were left out that are not in the cloud.", "Select them again.")
+        if record.correction(correction.kind) == correction.value:
             return document
-        trees = {i: record for i, record in document.trees.items() if i != trunk_id}
-        if after != TreeRecord():
-            trees[trunk_id] = after
-        return replace(document, trees=trees)
+        corrections = with_correction(record.corrections, correction)
+        return with_records(document, {trunk_id: replace(record, corrections=corrections)})
 
-    return Command(f"Describe trunk {trunk_id}", apply)
+    return Command(f"Correct the {_CORRECTED[correction.kind]} of trunk {trunk_id}", apply)
+
+
+def withdraw_correction(trunk_id: int, kind: CorrectionKind) -> Command:
+    """Measure one stem as the plot again, in one respect."""
+
+    def apply(document: Document) -> Document:
+        existing_trunk(document, trunk_id)
+        record = document.record(trunk_id)
+        if record.correction(kind) is None:
+            return document
+        return with_records(
+            document, {trunk_id: replace(record, corrections=without_correction(record.corrections, kind))}
+        )
+
+    return Command(f"Withdraw the {_CORRECTED[kind]} of trunk {trunk_id}", apply)
+
+
+def review_trees(reviews: Mapping[int, Review | None]) -> Command:
+    """Keep what was decided on looking at stems, by trunk id; None takes a decision back."""
+    wanted = sorted(reviews)
+
+    def apply(document: Document) -> Document:
+        return with_records(document, {i: _described(document, i, {"review": reviews[i]}) for i in wanted})
+
+    names = f"trunk {wanted[0]}" if len(wanted) == 1 else f"{len(wanted)} trunks"
+    return Command(f"Review {names}", apply)
+
+
+def with_records(document: Document, records: Mapping[int, TreeRecord]) -> Document:
+    """The document with other records of stems; the same object where none differs, empty records are not kept."""
+    if all(document.record(i) == record for i, record in records.items()):
+        return document
+    trees = {i: record for i, record in {**document.trees, **records}.items() if record != TreeRecord()}
+    return replace(document, trees=trees)
+
+
+def _described(document: Document, trunk_id: int, values: Mapping[str, Any]) -> TreeRecord:
+    existing_trunk(document, trunk_id)
+    try:
+        return replace(document.record(trunk_id), **values)
+    except (TypeError, ValueError) as error:
+        raise CommandError(f"This cannot be said about trunk {trunk_id}: {error}.") from None
 
 
 def _known_length(document: Document, name: str) -> ScaleBar | MarkerSquare:

@@ -81,7 +81,8 @@ def split_trunk(trunk_id: int, parts: Sequence[NDArray[Any]]) -> Command:
             after = after.with_trunk(Trunk(new_id, pieces[i], "hand"))
             # A tag hangs on one stem; of which species and which tree it is holds for both.
             record = document.record(trunk_id)
-            records[new_id] = replace(record, tag="", note="", edited=True)
+            # What was said of how it is measured, and that it was looked at, was said of another stem.
+            records[new_id] = replace(record, tag="", note="", edited=True, corrections=(), review=None)
         return _with(document, after, records)
 
     return Command(f"Split trunk {trunk_id}", apply)
@@ -261,11 +262,12 @@ def _filled_up(records: Sequence[TreeRecord]) -> TreeRecord:
     """The first record, with what it does not say taken from the others; notes are put one after another."""
     first, *others = records
     values: dict[str, Any] = {}
-    for name in ("species", "status", "tag", "tree_id"):
+    for name in ("species", "status", "tag", "tree_id", "health", "crown_class"):
         if not getattr(first, name):
             values[name] = next((getattr(each, name) for each in others if getattr(each, name)), getattr(first, name))
     notes = dict.fromkeys(each.note for each in records if each.note)
-    return replace(first, **values, note="; ".join(notes))
+    fields = {name: value for each in reversed(records) for name, value in each.fields}
+    return replace(first, **values, note="; ".join(notes), fields=tuple(fields.items()))
 
 
 def _inside(document: Document, points: NDArray[Any]) -> Int32:

@@ -151,6 +151,11 @@ class Session:
         return self._next_id
 
     @property
+    def author(self) -> str:
+        """Who decides here; empty where that is not known."""
+        return self.saver.author if self.saver is not None else ""
+
+    @property
     def can_undo(self) -> bool:
         """Whether there is a command to undo."""
         return bool(self._past)

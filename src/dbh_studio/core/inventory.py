@@ -5,72 +5,36 @@ What is not known is None, never 0. Column names carry their units. `io.inventor
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.scale import ScaleEstimate
-from dbh_studio.core.trunks import MAX_TRUNK_ID
+from dbh_studio.core.tree_record import TREE_STATUSES, Review, TreeRecord, TreeStatus, check_text
 
 # `core.dbh` needs scipy, which takes a second to import; the saved plot needs only `TreeRecord` from here.
 if TYPE_CHECKING:
     from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal
 
-TreeStatus = Literal["live", "dead", ""]
-TREE_STATUSES: tuple[TreeStatus, ...] = ("live", "dead", "")
+__all__ = [
+    "COLUMNS",
+    "TREE_STATUSES",
+    "Inventory",
+    "InventoryRow",
+    "MapPosition",
+    "TreeRecord",
+    "TreeStatus",
+    "check_text",
+    "inventory_row",
+    "review_state",
+]
 
 
-@dataclass(frozen=True)
-class TreeRecord:
-    """What a person says about a stem; nothing here is computed from the stem's points.
-
-    Attributes:
-        species: Name or code as the person writes it.
-        status: ``live``, ``dead`` or empty where nobody said.
-        note: Free text.
-        tag: The number on the tree's tag.
-        edited: Whether a person changed the stem's points.
-        tree_id: The tree this stem belongs to; None where the stem is a tree of its own.
-        flag: What the search that found the stem wants looked at; a person may clear it.
-    """
-
-    species: str = ""
-    status: TreeStatus = ""
-    note: str = ""
-    tag: str = ""
-    edited: bool = False
-    tree_id: int | None = None
-    flag: str = ""
-
-    def __post_init__(self) -> None:
-        for name in ("species", "note", "tag", "flag"):
-            check_text(name, getattr(self, name))
-        if self.status not in TREE_STATUSES:
-            raise ValueError(f"status is {self.status!r} but must be one of {TREE_STATUSES}")
-        if not isinstance(self.edited, bool):
-            raise ValueError(f"edited is {self.edited!r} but must be True or False")
-        if self.tree_id is not None:
-            is_whole = isinstance(self.tree_id, int) and not isinstance(self.tree_id, bool)
-            if not (is_whole and 0 < self.tree_id <= MAX_TRUNK_ID):
-                raise ValueError(f"tree id is {self.tree_id!r} but must be a number from 1 to {MAX_TRUNK_ID}")
-
-    @property
-    def remark(self) -> str:
-        """The note, and what is to be looked at."""
-        return "; ".join(filter(None, (self.note, self.flag)))
-
-
-def check_text(name: str, text: object) -> None:
-    """Raise ValueError unless `text` is one that a file can hold: half of a surrogate pair would stop all saving."""
-    if not isinstance(text, str):
-        raise ValueError(f"{name} is {text!r} but must be text")
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise ValueError(f"{name} is {text!r} but must be text that can be written as UTF-8") from None
+# A diameter that moves by more is another one than was looked at; less is not seen in a table.
+MOVED_CM = 0.05
 
 
 @dataclass(frozen=True)
@@ -102,6 +66,9 @@ class InventoryRow:
         x_m: With `y_m` and `z_ground_m`, in the world frame: metres about the plot's local origin, z up.
         scale_err_pct: Standard error of the scale. The intervals have it in them; every other length has it on top of
             its own error.
+        field_tape_cm: What a tape read in the field, as a person entered it; never mixed with the estimate.
+        corrections: Kinds of `core.corrections.Correction` that the measurement rests on.
+        review: ``accepted`` or ``doubtful``, ``stale`` where the number has moved since, empty where nobody looked.
         easting: With `northing`, in the source's coordinate reference system, where it has one.
     """
 
@@ -143,6 +110,12 @@ class InventoryRow:
     scale_source: str
     scale_err_pct: float | None
     note: str
+    health: str
+    crown_class: str
+    field_tape_cm: float | None
+    field_tape_height_m: float | None
+    corrections: str
+    review: str
     easting: float | None
     northing: float | None
     epsg: int | None
@@ -154,13 +127,21 @@ _DIAMETER_COLUMNS = tuple(name for name in COLUMNS if name.startswith("dbh_") an
 
 @dataclass(frozen=True)
 class Inventory:
-    """The rows in order of stem id. A table to read; it is never edited."""
+    """The rows in order of stem id. A table to read; it is never edited.
+
+    Attributes:
+        rows: One per stem.
+        own: Fields the person has added, as (stem id, ((name, value), …)); stems without any are not in it.
+    """
 
     rows: tuple[InventoryRow, ...] = ()
+    own: tuple[tuple[int, tuple[tuple[str, str], ...]], ...] = ()
 
     @classmethod
-    def of(cls, rows: Iterable[InventoryRow]) -> Inventory:
-        """Put rows in order of stem id.
+    def of(
+        cls, rows: Iterable[InventoryRow], own: Mapping[int, tuple[tuple[str, str], ...]] | None = None
+    ) -> Inventory:
+        """Put rows in order of stem id, with the fields the person has added.
 
         Raises:
             ValueError: Two rows have the same stem id.
@@ -168,13 +149,18 @@ class Inventory:
         ordered = tuple(sorted(rows, key=lambda row: row.stem_id))
         if len({row.stem_id for row in ordered}) != len(ordered):
             raise ValueError("two rows have the same stem id")
-        return cls(ordered)
+        return cls(ordered, tuple(sorted((i, pairs) for i, pairs in (own or {}).items() if pairs)))
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def __iter__(self) -> Iterator[InventoryRow]:
         return iter(self.rows)
+
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        """Names of the fields the person has added, in order."""
+        return tuple(sorted({name for _, pairs in self.own for name, _ in pairs}))
 
     @property
     def n_measured(self) -> int:
@@ -245,10 +231,29 @@ def inventory_row(
         scale_source=scale.source,
         scale_err_pct=_known(error_pct),
         note=record.note,
+        health=record.health,
+        crown_class=record.crown_class,
+        field_tape_cm=_known(record.correction("tape")),
+        field_tape_height_m=_known(record.correction("tape_height")),
+        corrections=";".join(each.kind for each in record.corrections if not each.kind.startswith("tape")),
+        review=review_state(record.review, result),
         easting=_known(position.easting) if position else None,
         northing=_known(position.northing) if position else None,
         epsg=position.epsg if position else None,
     )
+
+
+def review_state(review: Review | None, result: DbhEstimate | Refusal) -> str:
+    """The decision as it stands: ``accepted``, ``doubtful``, ``stale`` where the number has moved since, or empty."""
+    from dbh_studio.core.dbh import DbhEstimate
+
+    if review is None:
+        return ""
+    if isinstance(result, DbhEstimate):
+        is_same = review.dbh_cm is not None and abs(result.dbh_cm - review.dbh_cm) <= MOVED_CM
+    else:
+        is_same = review.dbh_cm is None and review.refusal == result.code
+    return review.decision if is_same else "stale"
 
 
 def _result_cells(result: DbhEstimate | Refusal, flag: str = "") -> dict[str, Any]:

@@ -30,17 +30,15 @@ _DECIMALS = {
     "y_m": 3,
     "z_ground_m": 3,
     "scale_err_pct": 3,
+    "field_tape_cm": 2,
+    "field_tape_height_m": 3,
     "easting": 3,
     "northing": 3,
 }
 
-# Of inventories written before diameters had intervals: still ours to replace.
-_EARLIER_COLUMNS = tuple(
-    column
-    for column in COLUMNS
-    if column not in ("taper_cm_per_m", "flags")
-    and (column == "dbh_cm" or not (column.startswith("dbh_") and column.endswith("_cm")))
-)
+# An inventory of this or an earlier version, and so ours to replace: later versions have more columns between these.
+_FIRST_COLUMNS = COLUMNS[:7]
+_LAST_COLUMN = "epsg"
 
 # OWASP, "CSV injection": these start a formula in Excel, LibreOffice and Google Sheets, at the start of a cell. Where
 # the decimal sign is a comma, a spreadsheet divides at semicolons and takes the quotes around our cell for letters:
@@ -151,7 +149,8 @@ def _is_inventory(path: Path) -> bool:
             header, *rows = csv.reader(file, strict=True)
     except (OSError, ValueError, csv.Error):
         return False
-    return tuple(header) in (COLUMNS, _EARLIER_COLUMNS) and all(len(row) == len(header) for row in rows)
+    is_ours = tuple(header[: len(_FIRST_COLUMNS)]) == _FIRST_COLUMNS and header[-1] == _LAST_COLUMN
+    return is_ours and set(header) <= set(COLUMNS) and all(len(row) == len(header) for row in rows)
 
 
 def projected_epsg(crs: str | None) -> tuple[bool, int | None]:

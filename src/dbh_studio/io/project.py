@@ -14,7 +14,6 @@ Each save writes a new trunks file (where trunks changed), then project.json in 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import os
 import zipfile
@@ -26,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from dbh_studio.core.inventory import TreeRecord
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.scale_evidence import ScaleEvidence
+from dbh_studio.core.tree_record import TreeRecord
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectVersionError
 from dbh_studio.io.atomic import atomic_file
+from dbh_studio.io.history import HISTORY_FILE, HistoryEntry, append_history, put_history_aside, read_history
 from dbh_studio.io.lock import lock_file
-from dbh_studio.io.ownfile import open_own_file
 from dbh_studio.io.project_model import (
     SCHEMA_VERSION,
     TRUNKS_FILE,
@@ -41,6 +40,7 @@ from dbh_studio.io.project_model import (
     PlotState,
     SavedEvidence,
     SavedProject,
+    SavedTree,
     camera_place,
     locate,
     migrated,
@@ -54,15 +54,16 @@ __all__ = [
     "PROJECT_FILE",
     "SCHEMA_VERSION",
     "CameraPlace",
+    "HistoryEntry",
     "PlotState",
     "ProjectWriter",
     "is_project",
+    "read_history",
     "read_project",
 ]
 
 FOLDER_SUFFIX = ".dbh"
 PROJECT_FILE = "project.json"
-HISTORY_FILE = "history.jsonl"
 LOCK_FILE = "lock"
 
 _TRUNK_ARRAYS = ("ids", "ends", "points", "origins")
@@ -106,13 +107,23 @@ def read_project(folder: Path | str) -> PlotState:
         scale=ScaleEstimate(saved.scale.metres_per_unit, saved.scale.source, saved.scale.standard_error),
         settings=saved.settings,
         trunks=trunks,
-        trees={i: TreeRecord(**tree.model_dump()) for i, tree in saved.trees.items()},
+        trees=_trees(folder, saved.trees),
         north_direction=saved.north_direction,
         origin_src=saved.origin_src,
         evidence=_evidence(folder, saved.evidence),
         cameras=None if saved.cameras is None else camera_place(folder, saved.cameras),
         masks=None if saved.masks is None else saved.masks.record(folder),
     )
+
+
+def _trees(folder: Path, saved: Mapping[int, SavedTree]) -> dict[int, TreeRecord]:
+    records = {}
+    for trunk_id, tree in saved.items():
+        try:
+            records[trunk_id] = tree.record()
+        except (TypeError, ValueError) as error:
+            raise _damaged(folder / PROJECT_FILE, f"trees.{trunk_id}: {error}") from None
+    return records
 
 
 def _evidence(folder: Path, saved: SavedEvidence) -> ScaleEvidence:
@@ -280,21 +291,13 @@ class ProjectWriter:
         self._saved = state.trunks, trunks_file
         self._remove_leftovers(trunks_file)
 
-    def log(self, entries: Iterable[Mapping[str, str]]) -> None:
+    def log(self, entries: Iterable[HistoryEntry]) -> None:
         """Append to the history.
 
         Raises:
             ProjectError: It cannot be written.
         """
-        text = "".join(json.dumps(dict(entry), ensure_ascii=False) + "\n" for entry in entries)
-        if not text:
-            return
-        try:
-            descriptor = open_own_file(self.folder / HISTORY_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND)
-            with open(descriptor, "a+b") as file:
-                _append_whole(file, text.encode("utf-8", errors="replace"))
-        except OSError as error:
-            raise ProjectError(f"The history of the plot could not be written ({error.strerror or error}).") from error
+        append_history(self.folder, entries)
 
     def put_history_aside(self) -> None:
         """Begin a new history, where another plot is to be saved in place of the one that is there.
@@ -302,16 +305,7 @@ class ProjectWriter:
         Raises:
             ProjectError: It cannot be renamed.
         """
-        history = self.folder / HISTORY_FILE
-        aside = (history.with_stem(f"{history.stem}-{number}") for number in itertools.count(1))
-        try:
-            history.rename(next(path for path in aside if not os.path.lexists(path)))
-        except FileNotFoundError:
-            pass
-        except OSError as error:
-            raise ProjectError(
-                f"The history of the plot could not be put aside ({error.strerror or error})."
-            ) from error
+        put_history_aside(self.folder)
 
     def close(self) -> None:
         """Give the plot free for others. The lock file stays: removing it would race with the next writer."""
@@ -352,18 +346,6 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _append_whole(file: IO[bytes], content: bytes) -> None:
-    """Append lines, after closing a line that a full disk or a crash cut off."""
-    end = file.seek(0, os.SEEK_END)
-    if end:
-        file.seek(end - 1)
-        if file.read(1) != b"\n":
-            content = b"\n" + content
-    file.write(content)
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _write_trunks(file: IO[bytes], trunks: TrunkSet) -> None:

@@ -1,6 +1,7 @@
 """What project.json holds, as models that check it, and the way between them and the program's own types.
 
-Schema 1 had no `masks`; a plot of that time is read as one whose trunks did not come from masks.
+Schema 1 had no `masks`; a plot of that time is read as one whose trunks did not come from masks. Schema 2
+had no health, crown class, own fields, corrections and reviews of trees.
 """
 
 from __future__ import annotations
@@ -14,14 +15,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
-from dbh_studio.core.inventory import TreeRecord, check_text
+from dbh_studio.core.corrections import Correction, CorrectionKind
 from dbh_studio.core.mask_record import MaskKind, MaskRecord, MaskRung
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
 from dbh_studio.core.scale_evidence import MarkedPoint, MarkerSquare, ScaleBar, ScaleEvidence, Sight
+from dbh_studio.core.tree_record import Review, ReviewDecision, TreeRecord, TreeStatus, check_text
 from dbh_studio.core.trunks import MAX_TRUNK_ID, TrunkSet
 from dbh_studio.settings import Settings
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 TRUNKS_FILE = re.compile(r"trunks-(\d+)\.npz")
 _MAX_POINTS = 2**31 - 1  # trunks are int32 indices
 
@@ -56,16 +58,49 @@ class SavedScale(_Model):
     standard_error: float | None = Field(ge=0)
 
 
+class SavedCorrection(_Model):
+    """A `Correction`; places and indices as lists."""
+
+    kind: CorrectionKind
+    value: Any
+    who: Text = ""
+    when: Text = ""
+    why: Text = ""
+
+
+class SavedReview(_Model):
+    """A `Review`."""
+
+    decision: ReviewDecision
+    dbh_cm: float | None = Field(None, gt=0)
+    refusal: Text = ""
+    who: Text = ""
+    when: Text = ""
+
+
 class SavedTree(_Model):
     """A `TreeRecord`."""
 
     species: Text = ""
-    status: Literal["live", "dead", ""] = ""
+    status: TreeStatus = ""
     note: Text = ""
     tag: Text = ""
     edited: bool = False
     tree_id: int | None = Field(None, gt=0, le=MAX_TRUNK_ID)
     flag: Text = ""
+    health: Text = ""
+    crown_class: Text = ""
+    fields: tuple[tuple[Text, Text], ...] = ()
+    corrections: tuple[SavedCorrection, ...] = ()
+    review: SavedReview | None = None
+
+    def record(self) -> TreeRecord:
+        """What was saved. Raises ValueError where it contradicts itself."""
+        nested = {
+            "corrections": tuple(Correction(**each.model_dump()) for each in self.corrections),
+            "review": None if self.review is None else Review(**self.review.model_dump()),
+        }
+        return TreeRecord(**(self.model_dump() | nested))
 
 
 class SavedSight(_Model):
@@ -180,9 +215,9 @@ class SavedMasks(_Model):
 
 
 class SavedProject(_Model):
-    """project.json, schema version 2."""
+    """project.json, schema version 3."""
 
-    schema_version: Literal[2] = 2
+    schema_version: Literal[3] = 3
     plot_id: Text
     source: SavedSource
     up_direction: tuple[float, float, float]
@@ -243,9 +278,8 @@ class PlotState:
 
 def migrated(content: dict[str, Any]) -> dict[str, Any]:
     """What an earlier program wrote, as this one would have."""
-    if content.get("schema_version") == 1:
-        return content | {"schema_version": 2}
-    return content
+    # Each version so far has only added what may be absent.
+    return content | {"schema_version": SCHEMA_VERSION}
 
 
 def camera_place(folder: Path, saved: SavedCameras) -> CameraPlace:
