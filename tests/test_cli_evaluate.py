@@ -168,6 +168,34 @@ def test_files_of_others_are_not_written_over(tables, tmp_path, capsys):
     assert (out / "pairs.csv").read_text() == INVENTORY
 
 
+def test_files_of_one_name_are_told_apart(tables, tmp_path):
+    first = tmp_path / "east" / "inventory.csv"
+    second = tmp_path / "west" / "inventory.csv"
+    for path in (first, second):
+        path.parent.mkdir()
+        shutil.copy(tables[0], path)
+    out = tmp_path / "out"
+    assert evaluate(first, second, tables[1], "--out", out) == EXIT_OK
+    assert {row["method"] for row in rows(out / "table.csv")} == {"east/inventory", "west/inventory"}
+
+
+def test_figures_of_an_earlier_report_go(tables, tmp_path):
+    out = tmp_path / "out"
+    assert evaluate(*tables, "--out", out, "--by", "Spp") == EXIT_OK
+    (out / "mine.svg").write_text("<svg/>")
+    assert (out / "scatter_by_Spp.svg").exists()
+    assert evaluate(*tables, "--out", out) == EXIT_OK
+    assert {path.name for path in out.iterdir()} == FILES | {"mine.svg"}
+    # A record somebody has changed removes nothing of others.
+    record = out / "evaluation.json"
+    (tmp_path / "other.svg").write_text("<svg/>")
+    content = json.loads(record.read_text()) | {"files": ["../other.svg", "mine.svg"]}
+    record.write_text(json.dumps(content))
+    assert evaluate(*tables, "--out", out) == EXIT_OK
+    assert (tmp_path / "other.svg").exists()
+    assert (out / "mine.svg").exists()
+
+
 def test_cross_sections_of_the_saved_plot(tmp_path, capsys):
     plot = make_plot(PlotRecipe.simple(points=60_000, seed=7))
     write_las(tmp_path / "plot.laz", plot.cloud)

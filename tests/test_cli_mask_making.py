@@ -214,7 +214,7 @@ def test_a_run_takes_the_ladder_and_the_next_one_what_is_kept(plot, tmp_path, ca
     out, _ = runs(capsys, "run", plot.cloud, "--out", tmp_path, *photos, "--masks", "auto", *making, "--json")
     report = json.loads(out)
     assert report["notes"][0].startswith("Trunks by detector and SAM (rung 1 of 4): 3 of 8 photos, about ")
-    assert any(note.startswith("3 masks were made, ") for note in report["notes"])
+    assert any(note.startswith("Masks made: 3, ") for note in report["notes"])
     assert "Trunks from 3 masks." in report["notes"] and report["n_stems"] >= 3
     state = read_project(tmp_path / "plot.dbh")
     assert state.masks.rung == "detector" and state.masks.n_masks == 3 and len(state.masks.models) == 2
@@ -222,7 +222,7 @@ def test_a_run_takes_the_ladder_and_the_next_one_what_is_kept(plot, tmp_path, ca
     # Over the earlier run: its masks are used again, for photos and recipe are the same.
     again = ["run", plot.cloud, "--out", tmp_path, *photos, "--masks", "auto", *making, "--overwrite", "--json"]
     notes = json.loads(runs(capsys, *again)[0])["notes"]
-    assert "3 masks are kept; nothing to do" in notes[0] and "0 masks were made; 3 were there." in notes
+    assert "3 masks are kept; nothing to do" in notes[0] and "Masks made: 0; there before: 3." in notes
     # On the saved plot, whose trunks may hold edits.
     stored = ["run", tmp_path / "plot.dbh", "--out", tmp_path, "--masks", "stored"]
     assert "--overwrite" in fails(capsys, 1, *stored)

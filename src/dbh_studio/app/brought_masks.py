@@ -340,7 +340,8 @@ def _numbers(wanted: Sequence[str]) -> tuple[int, ...]:
                 raise ValueError
         except ValueError:
             raise SettingError(
-                f"--mask-category {text}: mask pictures have numbers, not names.", "Use for example 7 or 1-12."
+                f"--mask-category {text}: mask pictures have numbers from 1 to 65535 (0 is no trunk), not names.",
+                "Use for example 7 or 1-12.",
             ) from None
         numbers.update(range(low, high + 1))
     return tuple(sorted(numbers))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,8 +71,30 @@ def evaluate_files(request: EvaluationRequest) -> Comparison:
         FileError: A table cannot be read or understood; says what to do.
         StudioError: The tables cannot be paired.
     """
-    tables = [read_stem_table(path, request.inventory_reading) for path in request.inventories]
+    names = _told_apart(request.inventories)
+    tables = [
+        replace(read_stem_table(path, request.inventory_reading), name=name)
+        for path, name in zip(request.inventories, names, strict=True)
+    ]
     return _compared(tables, request)
+
+
+def _told_apart(paths: Sequence[Path]) -> list[str]:
+    """What the tables are called: by their files, with as many folders as it takes to tell the files apart."""
+    absolute = [path.absolute() for path in paths]
+
+    def name(path: Path, n_folders: int) -> str:
+        return "/".join((*path.parts[-1 - n_folders : -1], path.stem))
+
+    names = []
+    for path in absolute:
+        others = [other for other in absolute if other != path]
+        depths = range(len(path.parts))
+        apart = (n for n in depths if all(name(other, n) != name(path, n) for other in others))
+        depth = next(apart, None)
+        # Else they differ by their endings alone.
+        names.append(path.name if depth is None else name(path, depth))
+    return names
 
 
 def evaluate_plot(session: Session, request: EvaluationRequest) -> Comparison:
@@ -121,7 +143,9 @@ def report_files(comparison: Comparison, pictures: Sequence[SectionPicture] = ()
     if pictures:
         files["sections.svg"] = sections_svg(pictures).encode()
     files["report.md"] = _report(comparison, [name for name in files if name.endswith(".svg")]).encode()
-    files[_RECORD] = json.dumps(record(comparison), indent=1, ensure_ascii=False, allow_nan=False).encode()
+    files[_RECORD] = json.dumps(
+        record(comparison) | {"files": sorted(files)}, indent=1, ensure_ascii=False, allow_nan=False
+    ).encode()
     return files
 
 
@@ -146,8 +170,9 @@ def write_report(
         FileError: The folder cannot be written, or holds files of these names that no evaluation wrote.
     """
     files = report_files(comparison, pictures)
+    earlier = _files_of_report(folder)
     in_the_way = [name for name in files if (folder / name).exists()]
-    if in_the_way and not overwrite and not _is_report(folder):
+    if in_the_way and not overwrite and earlier is None:
         raise FileError(
             folder / in_the_way[0],
             "there is such a file already, and no evaluation wrote it.",
@@ -161,6 +186,9 @@ def write_report(
         for name, content in files.items():
             with atomic_file(folder / name) as file:
                 file.write(content)
+        # Figures of the earlier report that this one has not would be taken for its own.
+        for name in set(earlier or ()) - set(files):
+            (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise FileError(
             folder,
@@ -199,12 +227,18 @@ def record(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _is_report(folder: Path) -> bool:
+def _files_of_report(folder: Path) -> tuple[str, ...] | None:
+    """The files of the report in a folder, as far as it says; None where there is no report."""
     try:
         content = json.loads((folder / _RECORD).read_bytes())
     except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(content, dict) and content.get("kind") == _KIND
+        return None
+    if not isinstance(content, dict) or content.get("kind") != _KIND:
+        return None
+    names = content.get("files", [])
+    # A record somebody has changed must not have other files removed.
+    is_plain = isinstance(names, list) and all(isinstance(n, str) and Path(n).name == n for n in names)
+    return tuple(n for n in names if n.endswith(".svg")) if is_plain else ()
 
 
 def _file_word(column: str, columns: Sequence[str]) -> str:

@@ -90,7 +90,7 @@ def take_ladder(
             progress=subprogress(progress, 0.05, 1.0),
         )
         pace = "" if made.seconds_per_photo is None else f", {duration(made.seconds_per_photo)} each"
-        notes += [f"{made.n_made:,} masks were made{pace}; {made.n_kept:,} were there.", *made.notes]
+        notes += [f"Masks made: {made.n_made:,}{pace}; there before: {made.n_kept:,}.", *made.notes]
         notes += list(made.problems.values())
     kept = plot_masks(session, known.posed)
     return TakenRung(ladder.chosen, kept if len(kept) else None, (*notes, *kept.notes))

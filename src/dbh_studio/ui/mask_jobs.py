@@ -280,7 +280,7 @@ class MaskJobs:
 
 
 def _made_notes(made: MadeMasks) -> tuple[str, ...]:
-    first = f"{made.n_made:,} masks were made, with {made.n_trunks:,} outlines of trunks."
+    first = f"Masks made: {made.n_made:,}, outlines of trunks in them: {made.n_trunks:,}."
     problems = [f"{name} was left out: {why}" for name, why in sorted(made.problems.items())[:3]]
     if len(made.problems) > len(problems):
         problems.append(f"{len(made.problems) - len(problems):,} more photos were left out.")
