@@ -20,8 +20,10 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
+import bench_dendromatics
 import numpy as np
 from estimator_stems import SCENARIOS, make_case
 from scipy.optimize import minimize
@@ -140,6 +142,20 @@ def estimator(*, drift_m: float = 0.0, **values: object) -> Method:
     return measure
 
 
+def dendromatics() -> Method:
+    """The peer's circle of the band the paper's curves get, upright about the axis all methods get."""
+    # Started when first asked.
+    ask = cache(bench_dendromatics.Dendromatics)
+
+    def measure(points: np.ndarray) -> Answer:
+        axis = shared_axis(points)
+        upright = points if axis is None else (points - axis.point_m) @ axis.rotation() + axis.point_m
+        circle = ask().circle(upright, section_m=0.30)
+        return Answer(100 * circle.diameter_m, refused=circle.refused)
+
+    return measure
+
+
 METHODS: dict[str, Method] = {
     "Fourier": paper_curve("fourier"),
     "ellipse": paper_curve("ellipse"),
@@ -150,6 +166,8 @@ METHODS: dict[str, Method] = {
     "round tube": estimator(roundness=1e-4),
     "ring": estimator(),
 }
+if bench_dendromatics.is_installed():
+    METHODS["dendromatics"] = dendromatics()
 
 
 def run(methods: dict[str, Method], seeds: range, scenarios: list[str]) -> dict[str, dict[str, list[tuple]]]:
