@@ -350,6 +350,17 @@ def test_killed_in_the_middle_it_goes_on_with_the_rest(session, models):
     assert plan_masks(session, MakeRequest(keyframes=6, settings=WHOLE, run=RUN), models=models).cost.is_measured
 
 
+def test_two_do_not_make_masks_of_one_plot_at_once(session, models):
+    from dbh_studio.io.lock import lock_file
+
+    plan = plan_masks(session, MakeRequest(keyframes=1, settings=WHOLE, run=RUN), models=models)
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    with lock_file(plan.folder / "making.lock"), pytest.raises(CommandError, match="made already") as told:
+        make_masks(plan)
+    assert "kept" in told.value.remedy
+    assert make_masks(plan).n_made == len(plan.photos)
+
+
 def test_cancelled_it_keeps_what_is_made(session, models):
     request = MakeRequest(keyframes=3, settings=WHOLE, run=RUN)
 

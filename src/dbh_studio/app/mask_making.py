@@ -11,7 +11,8 @@ computer loses one photo at most, and the next plan is what is left. `make_masks
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -26,7 +27,7 @@ from dbh_studio.app.session import Session
 from dbh_studio.core.arrays import UInt8
 from dbh_studio.core.posed_images import PosedImage
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
-from dbh_studio.errors import FileError
+from dbh_studio.errors import CommandError, FileError, ProjectLockedError
 
 if TYPE_CHECKING:
     from dbh_studio.io.masks import TrunkMask
@@ -80,17 +81,46 @@ def make_masks(plan: MaskPlan, *, progress: Progress = ignore_progress) -> MadeM
     A photo that cannot be read is told and left out. `progress` says which photo it is and how long it will take.
 
     Raises:
+        CommandError: They are being made already, by another process.
         FileError: The masks cannot be stored (a full disk), or none of the photos can be read.
         ModelError: A model cannot be opened, or failed.
         CancelledError: From `progress`; all masks made until then are kept.
     """
+    if not plan.photos:
+        return MadeMasks(plan.rung, 0, plan.n_kept, notes=plan.notes)
+    with _only_maker(plan.folder):
+        return _make(plan, progress)
+
+
+@contextmanager
+def _only_maker(folder: Path) -> Iterator[None]:
+    """Nobody else makes masks into the folder meanwhile. A cloud that is not saved as a plot has no other lock."""
+    from dbh_studio.io.lock import lock_file
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = lock_file(folder / "making.lock")
+    except ProjectLockedError as error:
+        raise CommandError(
+            f"Masks of this plot are being made already: {error.problem}",
+            "Wait until that ends, or stop it there; the masks it has made are kept.",
+        ) from None
+    except OSError as error:
+        raise FileError(
+            folder, f"Masks cannot be kept there ({error.strerror or error}).", "Make the folder writable."
+        ) from None
+    try:
+        yield
+    finally:
+        lock.close()
+
+
+def _make(plan: MaskPlan, progress: Progress) -> MadeMasks:
     from dbh_studio.io.masks import MaskStore
     from dbh_studio.io.models import ModelStore
     from dbh_studio.io.photos import read_photo
     from dbh_studio.stages.mask_models import open_grounded_sam
 
-    if not plan.photos:
-        return MadeMasks(plan.rung, 0, plan.n_kept, notes=plan.notes)
     models = open_grounded_sam(
         ModelStore(folder=plan.models_folder),
         plan.request.run,
