@@ -1,14 +1,17 @@
 """How well each method measures stems of known girth: a table per scenario, and the interval's calibration.
 
     python bench/estimator_lab.py                        the benchmark: 40 stems per scenario, seeds from 10 000
+    python bench/estimator_lab.py --first 900 -n 100     the same on seeds from 10 900
     python bench/estimator_lab.py --development          the same on seeds below 1000, for choosing and calibrating
     python bench/estimator_lab.py --calibrate            fit the interval's coefficients on development seeds
     python bench/estimator_lab.py --real [FOLDER]        eight real slices with a tape, whole and cut to arcs
 
-Every method gets the same stretch of stem, the same axis (a round tube fitted to 0.8-2.0 m), a band about 1.30 m where
-it works in a band (30 cm for the paper's curves as in the paper, 60 cm for circles, the better of the two), and one
-factor and one tolerance of its own, chosen on development seeds (`TUNED`). For the errors nobody may refuse; refusals
-and coverage are counted with the settings as they are.
+Every method gets the same stretch of stem and the same axis (a round tube fitted to 0.8-2.0 m). The paper's Fourier
+curve stands there twice: by the paper's words (`as_published`), and with a gate about a robust circle, the tape's
+definition, and the tolerance, origin and factor that did best on development seeds (`TUNED`), as the other curves and
+the circles do. Curves work in a band of 30 cm about 1.30 m, circles in 60 cm, the better of the two. For the errors
+nobody may refuse; refusals and coverage are counted with the settings as they are. With 40 stems a share of 90 % is
+uncertain by 5 %, with 200 by 2 %.
 """
 
 from __future__ import annotations
@@ -29,14 +32,16 @@ from estimator_stems import SCENARIOS, make_case
 from scipy.optimize import minimize
 
 from dbh_studio.core.axis import StemAxis
+from dbh_studio.core.curves import CURVES
+from dbh_studio.core.curves.base import outline_metrics
 from dbh_studio.core.dbh import CurveFit, measure_stem
-from dbh_studio.core.estimator import EstimatorResult, estimate_diameter
+from dbh_studio.core.estimator import assess_stem
 from dbh_studio.core.estimator.fit import fit_tube
 from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.search import find_rings
 from dbh_studio.core.estimator.tube import Tube
-from dbh_studio.core.robust import Circle
+from dbh_studio.core.robust import Circle, canonical_order, ransac
 from dbh_studio.io.pcd import read_pcd
 from dbh_studio.settings import EstimatorSettings, MeasureSettings
 
@@ -44,12 +49,17 @@ DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "tree
 RESULTS = Path(__file__).resolve().parent / "results"
 _LOST = 1.0  # relative error of a method that finds nothing
 _FACTOR = 1.645
-_AIM = 0.91
-_BARK = 0.005
-# One of twenty scenarios is made of passes that do not fit together; in the field it is more. Of the others those count
-# for more in which intervals too narrow do most harm.
-WEIGHTS = {"drift": 12.0, "bloat": 3.0, "neighbour": 3.0, "lidar, partial": 3.0, "arc 100": 3.0, "irregular": 1.5}
-_UNCLEAR = ("lidar", "lidar, partial", "neighbour")  # passes that drift a little, or two stems
+_AIM = 0.91  # a little above nine in ten: stems that were not fitted to are held less often
+_SMOOTH = 0.12  # of "inside", in the logarithm of the half width
+_PULL = 10.0  # of a scenario's coverage towards the aim, over the quantile loss
+# Of the first nearly all are refused, in the second two whole stems stand and which is meant cannot be known, and the
+# third is no tree.
+_NOT_FITTED_TO = ("arc 70", "neighbour", "clean")
+_UNCLEAR = ("lidar", "lidar, partial", "neighbour", "long")  # passes that drift a little, or two stems
+POOLS = {
+    "full rings": ("full", "full, noisy", "short", "lidar"),
+    "partial arcs": ("partial", "arc 180", "arc 140", "partial, noisy", "lidar, partial"),
+}
 
 
 @dataclass(frozen=True)
@@ -65,10 +75,11 @@ class Answer:
     flags: tuple[str, ...] = ()
 
 
-# Tolerance in metres and factor on the diameter, by method, both chosen on development seeds 300-311 (the spline's on
-# three of them): of 2, 3 and 5 cm the best (Fourier does not care), and what brings the median ratio to one. Circles
-# take theirs from the settings.
-TUNED = {"fourier": (0.02, 1.002), "ellipse": (0.02, 1.012), "bspline": (0.02, 0.95)}
+# Tolerance in metres and factor on the diameter, by method, both chosen on development seeds (300-311, the spline's on
+# three of them; Fourier's on 15 000-15 029, where polar coordinates about the centroid did better on arcs than about a
+# robust circle, 2 cm no worse than 3 and 5): of 2, 3 and 5 cm the best, and what brings the median ratio to one.
+# Circles take theirs from the settings.
+TUNED = {"fourier": (0.02, 1.008), "ellipse": (0.02, 1.012), "bspline": (0.02, 0.95)}
 
 Method = Callable[[np.ndarray], Answer]
 
@@ -94,7 +105,7 @@ def shared_axis(points: np.ndarray) -> StemAxis | None:
     return StemAxis(point, direction, Circle(point[:2], tube.radius, tube.sigma), "stem")
 
 
-def paper_curve(name: str, *, tolerance_m: float | None = None) -> Method:
+def paper_curve(name: str, *, tolerance_m: float | None = None, **values: object) -> Method:
     tolerance, factor = TUNED[name]
     settings = MeasureSettings(
         curve=name,  # type: ignore[arg-type]
@@ -104,6 +115,7 @@ def paper_curve(name: str, *, tolerance_m: float | None = None) -> Method:
         ransac_tolerance_m=tolerance if tolerance_m is None else tolerance_m,
         min_coverage_deg=0.0,
         min_points=8,
+        **values,  # type: ignore[arg-type]
     )
 
     def measure(points: np.ndarray) -> Answer:
@@ -119,24 +131,46 @@ def paper_curve(name: str, *, tolerance_m: float | None = None) -> Method:
     return measure
 
 
+def as_published(name: str) -> Method:
+    """The paper's curve by its words: 50 points, 5 cm, 100 times, refit, most inliers; perimeter/π; nothing left out.
+
+    On the axis that all methods get. Open in the paper and taken as in the study: polar coordinates about the
+    centroid of the band.
+    """
+    curve = CURVES[name]
+
+    def measure(points: np.ndarray) -> Answer:
+        axis = shared_axis(points)
+        start = time.process_time()
+        if axis is None:
+            return Answer(np.nan, refused=True)
+        band = points[np.abs(points[:, 2] - 1.3) <= 0.15]
+        uv = ((band[canonical_order(band)] - axis.point_m) @ axis.rotation())[:, :2]
+        found = None
+        if len(uv) >= 8:
+            rng = np.random.default_rng([0, *name.encode()])
+            found = ransac(uv - uv.mean(axis=0), curve, n_samples=50, tolerance=0.05, n_iterations=100, rng=rng)
+        ms = 1000 * (time.process_time() - start)
+        if found is None:
+            return Answer(np.nan, refused=True, ms=ms)
+        perimeter, _, _ = outline_metrics(curve.outline(found.params))
+        return Answer(100 * perimeter / np.pi, ms=ms)
+
+    return measure
+
+
 def estimator(*, drift_m: float = 0.0, **values: object) -> Method:
     settings = EstimatorSettings(**values)  # type: ignore[arg-type]
-    open_to_all = settings.changed(max_half_width=2.0, min_points=15, min_arc_deg=0.0, max_depth_noise=10.0)
 
     def measure(points: np.ndarray) -> Answer:
         start = time.process_time()
-        result = estimate_diameter(points, settings=open_to_all, drift_m=drift_m)
+        found = assess_stem(points, settings=settings, drift_m=drift_m)  # what it found, refused or not
         ms = 1000 * (time.process_time() - start)
-        if not isinstance(result, EstimatorResult):
+        refused = found.refusal is not None
+        if found.result is None:
             return Answer(np.nan, refused=True, ms=ms)
-        chosen = result.chosen
-        half = float(np.log(chosen.high_cm / chosen.value_cm))
+        result, chosen = found.result, found.result.chosen
         flags = tuple(flag.code for flag in result.flags)
-        refused = (
-            half > settings.max_half_width
-            or result.arc_deg < settings.min_arc_deg
-            or result.spread.depth_noise > settings.max_depth_noise
-        )
         return Answer(chosen.value_cm, chosen.low_cm, chosen.high_cm, refused, ms, result.spread, flags)
 
     return measure
@@ -157,7 +191,8 @@ def dendromatics() -> Method:
 
 
 METHODS: dict[str, Method] = {
-    "Fourier": paper_curve("fourier"),
+    "paper's Fourier": as_published("fourier"),
+    "Fourier": paper_curve("fourier", polar_origin="centroid"),
     "ellipse": paper_curve("ellipse"),
     "spline": paper_curve("bspline"),
     "circle": estimator(method="circle", bloat_chance=0.0),
@@ -223,7 +258,8 @@ def print_tables(found: dict[str, dict[str, list[tuple]]]) -> None:
     methods, scenarios = list(found), list(next(iter(found.values())))
     print("\nMedian |relative error| % (90th percentile)\n")
     print("| scenario | " + " | ".join(methods) + " |\n|---" + "|--:" * len(methods) + "|")
-    for scenario in [*scenarios, "all"]:
+    pools = [name for name, members in POOLS.items() if set(members) <= set(scenarios)]
+    for scenario in [*scenarios, *pools, "all"]:
         cells = []
         for name in methods:
             s = score(_rows(found[name], scenario))
@@ -247,36 +283,39 @@ def print_tables(found: dict[str, dict[str, list[tuple]]]) -> None:
 
 
 def _rows(by_scenario: dict[str, list[tuple]], scenario: str) -> list[tuple]:
-    return [row for rows in by_scenario.values() for row in rows] if scenario == "all" else by_scenario[scenario]
+    members = tuple(by_scenario) if scenario == "all" else POOLS.get(scenario, (scenario,))
+    return [row for name in members for row in by_scenario[name]]
 
 
 def calibrate(by_scenario: dict[str, list[tuple]], now: Calibration) -> Calibration:
-    """The coefficients for which, whatever the terms say, nine in ten errors are within the interval.
+    """The coefficients for which, whatever the terms say, nine in ten errors are within the interval in every scenario.
 
     First a logistic regression of "passes do not fit together" on stems of which half the ring or more was seen. Then
-    quantile regression of ln |error| on ln of the half width: every stem counts alike, however wide its interval, but
-    some scenarios for more (`WEIGHTS`). Aimed a little above nine in ten, because stems that were not fitted to are
-    held less often.
+    quantile regression of ln |error| on ln of the half width. Every scenario counts alike, and how far the share held
+    in it is from nine in ten is added: an interval that is too wide in one place must not pay for one too narrow in
+    another.
     """
     rows = [(name, t, a) for name, found in by_scenario.items() for t, a in found if a.spread is not None]
     rows = [row for row in rows if np.isfinite(row[2].value_cm) and not row[2].refused]
     drift = _drift_odds(rows)
+    rows = [row for row in rows if row[0] not in _NOT_FITTED_TO]
     with_drift = Calibration(now.coefficients, drift, _FACTOR)
-    size = np.log([max(abs(np.log(a.value_cm / t)), 1e-4) for _, t, a in rows])
+    size = np.log([max(abs(np.log(a.value_cm / t)), 1e-4) for _, t, a in rows]) - np.log(_FACTOR)
     terms = np.stack([a.spread.terms(with_drift.drift_chance(a.spread)) for _, _, a in rows]) ** 2
-    weight = np.array([WEIGHTS.get(name, 1.0) for name, _, _ in rows])
-    weight /= weight.sum()
+    names = np.array([name for name, _, _ in rows])
+    parts = [np.flatnonzero(names == name) for name in dict.fromkeys(names)]
 
     def loss(log_coefficients: np.ndarray) -> float:
-        over = size - np.log(_FACTOR) - 0.5 * np.log(terms @ np.exp(2 * log_coefficients))
-        return float(weight @ np.where(over > 0, _AIM * over, (_AIM - 1.0) * over))
+        over = size - 0.5 * np.log(terms @ np.exp(2 * log_coefficients) + 1e-12)
+        quantile = np.where(over > 0, _AIM * over, (_AIM - 1.0) * over)
+        inside = 1.0 / (1.0 + np.exp(np.clip(over / _SMOOTH, -50, 50)))
+        each = [quantile[part].mean() + _PULL * (inside[part].mean() - _AIM) ** 2 for part in parts]
+        return float(np.mean(each) + 1e-4 * np.square(log_coefficients + 2.0).sum())
 
-    found = np.full(terms.shape[1], np.log(0.3))
-    found[0] = np.log(_BARK)
-    bounds = [(np.log(_BARK), -3.0)] + [(-7.0, 3.0) if term > 0 else (-7.0, -6.9) for term in terms.max(axis=0)[1:]]
-    for _ in range(4):
-        found = minimize(loss, found, method="Powell", bounds=bounds).x
-    coefficients = np.where(found < -6.5, 0.0, np.exp(found))
+    bounds = [(-9.0, 3.0)] * terms.shape[1]
+    starts = [np.full(terms.shape[1], start) for start in (-1.2, -3.0)]
+    found = min((minimize(loss, start, method="L-BFGS-B", bounds=bounds) for start in starts), key=lambda r: r.fun).x
+    coefficients = np.where(terms.max(axis=0) > 0, np.exp(found), 0.0)
     return Calibration(tuple(float(f"{c:.3g}") for c in coefficients), drift, _FACTOR)
 
 
@@ -362,7 +401,7 @@ def main() -> None:
         treescope(options.real, {name: METHODS[name] for name in options.methods})
         return
     first = (1 if options.development or options.calibrate else 10_000) + options.first
-    names = ["ring", "circle, bloat"] if options.calibrate else options.methods
+    names = [name for name in options.methods if name in ("ring", "circle, bloat") or not options.calibrate]
     found = run({name: METHODS[name] for name in names}, range(first, first + options.n), options.scenarios)
     if options.calibrate:
         for name in names:

@@ -97,6 +97,22 @@ SCENARIOS = {
         points=(200, 3000),
     ),
     "neighbour": Scenario(arc_deg=(180, 320), touching=True),
+    # The paper's categories, which mix what stands apart above.
+    "partial": Scenario(arc_deg=(80, 240), noise_m=(0.005, 0.02), clutter=(0.0, 0.25)),
+    "backpack": Scenario(arc_deg=(120, 360), noise_m=(0.005, 0.015), clutter=(0.05, 0.25)),
+    "drone": Scenario(
+        arc_deg=(90, 360), noise_m=(0.01, 0.03), bloat_m=(0.002, 0.01), clutter=(0.05, 0.3), points=(200, 3000)
+    ),
+    "short": Scenario(arc_deg=(240, 360), noise_m=(0.003, 0.01)),
+    "long": Scenario(
+        arc_deg=(90, 360),
+        noise_m=(0.006, 0.02),
+        passes=3,
+        drift_m=(0.004, 0.02),
+        clutter=(0.05, 0.25),
+        points=(200, 4000),
+    ),
+    "clean": Scenario(noise_m=(0.001, 0.003), bloat_m=(0.0, 1e-9), clutter=(0.0, 1e-9), irregularity=(1e-3, 2e-3)),
 }
 
 
@@ -115,17 +131,17 @@ def make_case(name: str, seed: int) -> Case:
     """The stem of a scenario and a seed."""
     scenario = SCENARIOS[name]
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    stem = _stem(scenario, seed, rng)
+    stem = stem_of(scenario, seed, rng)
     n_points = int(_log_uniform(rng, scenario.points))
     n_clutter = int(n_points * rng.uniform(*scenario.clutter))
     arc = float(rng.uniform(*scenario.arc_deg))
-    parts = [_seen(scenario, stem, n_points - n_clutter, arc, rng)]
-    parts += _clutter(stem, n_clutter, rng)
+    parts = [seen_of(scenario, stem, n_points - n_clutter, arc, rng)]
+    parts += clutter_about(stem, n_clutter, rng)
     if scenario.touching:
         other = _neighbour(stem, rng)
         other_arc = float(rng.uniform(120, 240))
         n_other = int(rng.uniform(0.2, 0.7) * n_points)
-        parts.append(_seen(replace(scenario, touching=False), other, n_other, other_arc, rng))
+        parts.append(seen_of(replace(scenario, touching=False), other, n_other, other_arc, rng))
     points = np.concatenate(parts)
     # Where breast height is depends on the ground, which is known to some centimetres.
     points[:, 2] += rng.normal(0.0, 0.02)
@@ -138,7 +154,7 @@ def _log_uniform(rng: np.random.Generator, bounds: Range) -> float:
     return float(np.exp(rng.uniform(*np.log(bounds))))
 
 
-def _stem(scenario: Scenario, seed: int, rng: np.random.Generator) -> Stem:
+def stem_of(scenario: Scenario, seed: int, rng: np.random.Generator) -> Stem:
     recipe = PlotRecipe(
         n_trees=1, seed=seed, irregularity=float(rng.uniform(*scenario.irregularity)), side_m=10.0, lean_max_deg=6.0
     )
@@ -169,7 +185,7 @@ def _neighbour(stem: Stem, rng: np.random.Generator) -> Stem:
     return replace(stem, base=base, radius_m=radius, harmonics=stem.harmonics * [1, 1, -1], ridge_m=0.3 * stem.ridge_m)
 
 
-def _seen(scenario: Scenario, stem: Stem, n_points: int, arc_deg: float, rng: np.random.Generator) -> np.ndarray:
+def seen_of(scenario: Scenario, stem: Stem, n_points: int, arc_deg: float, rng: np.random.Generator) -> np.ndarray:
     """(N, 3) points of the bark with the errors of the cameras that saw them."""
     middle = rng.uniform(0, 2 * np.pi)
     faces = middle + np.arange(scenario.faces) * (2 * np.pi / scenario.faces)
@@ -213,7 +229,7 @@ def _without_holes(stem: Stem, angle: np.ndarray, height: np.ndarray, rng: np.ra
     return keep
 
 
-def _clutter(stem: Stem, n_points: int, rng: np.random.Generator) -> list[np.ndarray]:
+def clutter_about(stem: Stem, n_points: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Ferns, stubs, ivy, a bank of soil, a bush and stray points, in random shares."""
     share = rng.dirichlet(np.full(6, 0.6))
     fern, stub, ivy, bank, bush, stray = np.floor(n_points * share).astype(int)

@@ -4,6 +4,10 @@ The slices are trunks of TreeScope VAT-0723M-05 (LiDAR-SLAM, z = height above gr
 cannot be seen and is taken as zero. The last column is what the data set's authors report for their own method.
 
     python bench/treescope.py [FOLDER]
+    python bench/treescope.py --cut [FOLDER]     a quarter, a half and two thirds of the ring cut away
+
+Each stem is cut at eight places round it: how error and interval of the default grow beside those of a robust circle,
+and what is refused. What is kept is thinned towards its edges as it is when a stem is seen from one side.
 """
 
 from __future__ import annotations
@@ -25,6 +29,8 @@ DEFAULT_FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data" / "tree
 
 
 METHODS = (*INTERVAL_METHODS, *CURVES)
+CUT_AWAY = {"nothing": 0.0, "a quarter": 1 / 4, "a half": 1 / 2, "two thirds": 2 / 3}
+_PLACES = 8
 
 
 def diameters_cm(path: Path) -> tuple[dict[str, float], tuple[float, float], float]:
@@ -47,10 +53,55 @@ def diameters_cm(path: Path) -> tuple[dict[str, float], tuple[float, float], flo
     return {name: found.get(name, np.nan) for name in METHODS}, interval, seconds
 
 
-def main(folder: Path) -> None:
+def cut(points: np.ndarray, centre: np.ndarray, share: float, place: int) -> np.ndarray:
+    """(N, 3) points without a sector of the ring, the edges of the rest thinned out over 15 degrees."""
+    middle = 0.4 + place * (2 * np.pi / _PLACES)
+    angle = np.arctan2(points[:, 1] - centre[1], points[:, 0] - centre[0])
+    from_edge = np.pi * (1.0 - share) - np.abs((angle - middle + np.pi) % (2 * np.pi) - np.pi)
+    kept = np.random.default_rng([place, len(points)]).random(len(points)) < from_edge / np.radians(15.0)
+    return points[kept] if share else points
+
+
+def print_cut(folder: Path, rows: list[dict[str, str]]) -> None:
+    """Per share cut away and method: error, interval and refusals."""
+    print("| cut away | method | cuts | refused | median % | 90th percentile % | bias % | half width % | holds % |")
+    print("|---|---" + "|--:" * 7 + "|")
+    stems = []
+    for row in rows:
+        cloud = read_pcd(folder / row["file"]).cloud
+        points = cloud.xyz + cloud.origin
+        whole = measure_stem(points, settings=MeasureSettings(curve="circle"))
+        centre = whole.position_m if isinstance(whole, DbhEstimate) else np.median(points, axis=0)
+        stems.append((points, centre, float(row["dbh_cm"])))
+    for name, share in CUT_AWAY.items():
+        for method in INTERVAL_METHODS:
+            settings, found, n_cuts = MeasureSettings(curve=method), [], 0
+            for points, centre, tape in stems:
+                for place in range(_PLACES if share else 1):
+                    n_cuts += 1
+                    result = measure_stem(cut(points, centre, share, place), settings=settings)
+                    if isinstance(result, DbhEstimate) and result.interval is not None:
+                        found.append((result.dbh_cm / tape - 1.0, *(end / tape - 1.0 for end in result.interval)))
+            print(f"| {name} | {method} | {n_cuts} | {n_cuts - len(found)} | {_cut_figures(np.array(found))} |")
+
+
+def _cut_figures(found: np.ndarray) -> str:
+    if not len(found):
+        return "– | – | – | – | –"
+    error, low, high = found.T
+    size = 100 * np.abs(error)
+    figures = (np.median(size), np.quantile(size, 0.9), 100 * np.median(error), 50 * np.median(high - low))
+    held = 100 * np.mean((low <= 0) & (high >= 0))
+    return f"{figures[0]:.1f} | {figures[1]:.1f} | {figures[2]:+.1f} | {figures[3]:.1f} | {held:.0f}"
+
+
+def main(folder: Path, *, is_cut: bool) -> None:
     if not folder.is_dir():
         sys.exit(f"{folder} is not there: give the folder with reference.csv and the slices.")
     rows = list(csv.DictReader((folder / "reference.csv").read_text().splitlines()))
+    if is_cut:
+        print_cut(folder, rows)
+        return
     methods = [*METHODS, "published"]
     print("| tree | tape cm | " + " | ".join(f"{name} cm (error)" for name in methods) + " | 90 % interval | ms |")
     print("|---" * (len(methods) + 4) + "|")
@@ -75,4 +126,5 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DEFAULT_FOLDER)
+    given = [argument for argument in sys.argv[1:] if argument != "--cut"]
+    main(Path(given[0]) if given else DEFAULT_FOLDER, is_cut="--cut" in sys.argv)

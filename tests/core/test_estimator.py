@@ -93,11 +93,35 @@ class TestTruth:
         assert high.height_m == 1.4
         assert high.dbh_cm == pytest.approx(50.0 - 0.24, abs=0.1)
 
-    def test_tape_lies_on_the_bark(self):
-        points = stem()
-        bare, barked = measured(points, settings=SMOOTH), measured(points, settings=SMOOTH.changed(bark_share=0.02))
-        assert barked.diameters["tape"].value_cm == pytest.approx(1.02 * bare.diameters["tape"].value_cm, rel=1e-9)
-        assert barked.diameters["area"] == bare.diameters["area"]
+    def test_tape_lies_on_the_bark_as_far_as_bark_is_seen(self):
+        """Ridges that the points show count; where noise drowns them the expectation does; smooth bark has none."""
+        settings = EstimatorSettings(bark_share=0.007)
+        for n_ridges, height, within in ((17, 0.02, 0.008), (25, 0.012, 0.003)):
+            points = stem(n=6000, noise=0.003, waves=((n_ridges, height, 0.0),))
+            t = np.linspace(0, 2 * np.pi, 7201)
+            x, y = (0.2 * (1 + height * np.cos(n_ridges * t)) * f(t) for f in (np.cos, np.sin))
+            facing = np.linspace(0, 2 * np.pi, 721)[:-1]
+            girth = np.mean([(x * np.cos(a) + y * np.sin(a)).max() for a in facing]) * 2 * np.pi  # Cauchy
+            rough = measured(points, settings=settings)
+            assert rough.diameters["tape"].value_cm == pytest.approx(100 * girth / np.pi, rel=within)
+            assert rough.diameters["area"].value_cm == pytest.approx(40.0, rel=0.003)
+        blurred = stem(n=300, noise=0.03)
+        bare, barked = measured(blurred, settings=SMOOTH), measured(blurred, settings=settings)
+        assert barked.dbh_cm / bare.dbh_cm == pytest.approx(1.007, abs=0.0015)
+        assert barked.diameters["area"].value_cm == bare.diameters["area"].value_cm
+
+    @pytest.mark.parametrize("radius", [0.05, 0.2, 0.5])
+    @pytest.mark.parametrize("noise", [0.001, 0.003])
+    def test_clean_cylinder_reads_as_it_is_with_the_default(self, radius, noise):
+        """Nothing is added for bark, bloat or waves that are not there, but what the noise leaves open."""
+        off = [measured(stem(radius, noise=noise, seed=seed)).dbh_cm - 200 * radius for seed in range(4)]
+        assert abs(np.mean(off)) < 0.05 * noise / 0.001
+
+    def test_noise_widens_the_interval_and_does_not_move_the_diameter(self):
+        found = [measured(stem(n=2500, noise=noise), settings=SMOOTH) for noise in (0.002, 0.006, 0.018)]
+        assert [result.dbh_cm for result in found] == pytest.approx([40.0] * 3, abs=0.25)
+        widths = [result.chosen.half_width for result in found]
+        assert widths[0] < widths[1] < widths[2]
 
     def test_half_a_ring(self):
         half, whole = measured(stem(arc_deg=180, noise=0.006)), measured(stem(noise=0.006))
@@ -190,12 +214,11 @@ class TestRobust:
         assert "fork" in codes(result)
         assert "neighbour" not in codes(result)
 
-    def test_two_stems_that_the_curve_reaches_round_fall_back_on_the_circle(self):
-        """A stem of the laboratory with another against it, of which the curve alone read 57 cm in place of 48.5."""
+    def test_two_stems_that_a_curve_could_reach_round_are_not_averaged(self):
+        """A stem of the laboratory with another against it, of which a curve round both would read 57 cm, not 48.5."""
         (case,) = _cases("neighbour", [313])
         result = measured(case.points_m)
-        assert result.method == "circle"
-        assert {"fallback", "neighbour"} <= codes(result)
+        assert "neighbour" in codes(result)
         assert result.dbh_cm == pytest.approx(case.tape_cm, rel=0.08)
 
     def test_flutes(self):
@@ -343,7 +366,7 @@ class TestInterval:
     def test_by_hand(self):
         calibration = Calibration((0.003, 1.0, 0.4, 0.08, 1.0, 0.5, 2.0, 0.03, 4.0), (0.0, 0.0, 0.0), 2.0)
         assert self.spread.depth_noise == pytest.approx(0.05, rel=1e-12)  # half a ring is as deep as its radius
-        terms = [0.003, 0.01, 0.01, 0.08, 0.005, 0.5 * 0.01, 0.5 * 0.04, 0.5 * 0.03, 4.0 * 0.0025]
+        terms = [0.003, 0.01, 0.01, 0.08, 0.005, 0.5 * 0.01, 0.5 * 0.04, 0.5 * 0.03, 4.0 * 0.025]
         assert calibration.log_sd(self.spread) == pytest.approx(np.sqrt(np.sum(np.square(terms))), rel=1e-12)
 
     def test_chance_of_drift_by_hand(self):
@@ -366,14 +389,18 @@ class TestInterval:
         drifting = measured(points, drift_m=0.02)
         assert drifting.log_sd == pytest.approx(np.hypot(known.log_sd, 0.02 / known.spread.diameter_m), rel=1e-9)
 
-    @pytest.mark.parametrize("scenario", ["full", "arc 180", "drift", "bloat", "clutter", "lidar, partial"])
-    def test_holds_the_tape_on_generated_stems(self, scenario):
+    @pytest.mark.parametrize(
+        ("scenario", "widest"),
+        [("full", 0.035), ("arc 180", 0.09), ("drift", 0.14), ("bloat", 0.06), ("clutter", 0.06), ("partial", 0.12)],
+    )
+    def test_holds_the_tape_on_generated_stems(self, scenario, widest):
         """On seeds that nothing was fitted to; of 25 stems 90 % is 22.5, and fewer than 17 comes once in 500 times."""
         answers = [(case.tape_cm, estimate_diameter(case.points_m)) for case in _cases(scenario, range(801, 826))]
         given = [(tape, result) for tape, result in answers if isinstance(result, EstimatorResult)]
         assert len(given) >= 18
         assert sum(result.chosen.holds(tape) for tape, result in given) >= 0.68 * len(given)
         assert np.median([abs(result.dbh_cm / tape - 1.0) for tape, result in given]) < 0.08
+        assert np.median([result.chosen.half_width for _, result in given]) < widest
 
     def test_holds_the_truth_of_most_irregular_stems(self):
         held, n = 0, 40

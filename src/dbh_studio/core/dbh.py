@@ -13,7 +13,14 @@ from dbh_studio.core.arrays import Float64, as_points, readonly
 from dbh_studio.core.axis import WINDOW, StemAxis, band_m, stem_axis
 from dbh_studio.core.curves import CURVES
 from dbh_studio.core.curves.base import outline_centroid
-from dbh_studio.core.interval_methods import INTERVAL_METHODS, compared_fit, measured_with_interval
+from dbh_studio.core.estimator import heap_signs
+from dbh_studio.core.estimator.heap import LIKELY_CLUTTER, clutter_flag
+from dbh_studio.core.interval_methods import (
+    INTERVAL_METHODS,
+    compared_fit,
+    estimator_settings,
+    measured_with_interval,
+)
 from dbh_studio.core.measured import CurveFit, DbhEstimate, Diameter, Refusal
 from dbh_studio.core.quality import disagreement_of, grade, plain_flags
 from dbh_studio.core.robust import canonical_order
@@ -91,7 +98,8 @@ def measure_stem(
         )
     finite_points = points[finite]
     fits = {name: compared_fit(name, finite_points, section, settings, seed, scale_sd=scale_sd) for name in names}
-    return _judged(section, fits, settings, ground_note, axis)
+    found = _judged(section, fits, settings, ground_note, axis)
+    return found if isinstance(found, Refusal) else _warned(found, finite_points, settings, seed)
 
 
 def axis_of_stem(
@@ -198,6 +206,18 @@ def _judged(
         flag_codes=tuple(flag.code for flag in flags),
         taper_cm_per_m=None if axis.taper is None else 200.0 * axis.taper,
     )
+
+
+def _warned(found: DbhEstimate, points: NDArray[np.floating[Any]], settings: MeasureSettings, seed: int) -> DbhEstimate:
+    """With a flag where what was measured looks like no stem. The paper's curves give their number all the same."""
+    motion = found.section.stem_from_section
+    axis = StemAxis(motion.translation, motion.rotation[:, 2], None, found.section.axis_source)
+    options = estimator_settings(settings, "shrinkage")
+    signs = heap_signs(points, axis, found.section.ring_radius_m, settings=options, seed=seed)
+    if signs is None or signs.chance <= LIKELY_CLUTTER:
+        return found
+    flag = clutter_flag(signs)
+    return replace(found, flags=(flag.words, *found.flags), flag_codes=(flag.code, *found.flag_codes))
 
 
 def _centre(fit: CurveFit) -> Float64:

@@ -91,7 +91,7 @@ def measured_with_interval(
         if name not in fits
     )
     if found.refusal is not None:
-        return replace(found.refusal, section=section, fits=fits)
+        return replace(found.refusal, section=section, fits=fits, rings=result.rings)
     return _estimate(result, settings, section, fits, ground_note)
 
 
@@ -123,6 +123,7 @@ def _estimate(
         position_m=result.position_m,
         flag_codes=tuple(flag.code for flag in flags),
         taper_cm_per_m=result.taper_cm_per_m,
+        rings=result.rings,
     )
 
 

@@ -45,13 +45,28 @@ class Flag:
     Attributes:
         code: Short name for tables: ``partial_arc``, ``gap``, ``double_wall``, ``bulge``, ``buttress``, ``fluting``,
             ``not_round``, ``not_at_height``, ``neighbour``, ``fork``, ``few_points``, ``lean``, ``short_stretch``,
-            ``fallback``, ``wide_interval``, ``profile``, ``ground``; of the paper's curves also ``disagree``,
-            ``thick_ring``, ``off_curve``, ``upright``.
+            ``fallback``, ``wide_interval``, ``profile``, ``ground``, ``clutter``, ``above_bulge``, ``above_buttress``,
+            ``drawn``; of the paper's curves also ``disagree``, ``thick_ring``, ``off_curve``, ``upright``.
         words: For the forester.
     """
 
     code: str
     words: str
+
+
+@dataclass(frozen=True, eq=False)
+class SectionRing:
+    """One of the stems in a section, for the picture and to split them.
+
+    Attributes:
+        centre_m: (2,) x and y at breast height, stem frame.
+        radius_m: Of a circle.
+        n_points: On it, of those looked at.
+    """
+
+    centre_m: Float64
+    radius_m: float
+    n_points: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +125,13 @@ class Refusal:
 
     Attributes:
         code: Short name for tables and tests: ``no_points``, ``no_band``, ``too_few_points``, ``no_ring``,
-            ``small_arc``, ``too_uncertain``, ``no_curve``, ``implausible``; ``unscaled`` from the stages.
+            ``clutter``, ``two_rings``, ``small_arc``, ``too_uncertain``, ``no_curve``, ``implausible``,
+            ``not_regular``; ``unscaled`` from the stages.
         reason: One sentence for the forester.
         remedy: What to do.
         section: The cross-section, where there is one to look at.
         fits: Curves fitted nonetheless, for the picture only.
+        rings: The stems in the section, that with most points first, where any were told apart.
     """
 
     code: str
@@ -122,6 +139,7 @@ class Refusal:
     remedy: str
     section: CrossSection | None = None
     fits: Mapping[str, CurveFit | Refusal] = field(default_factory=dict)
+    rings: tuple[SectionRing, ...] = ()
 
     def __bool__(self) -> bool:
         return False
@@ -143,6 +161,7 @@ class DbhEstimate:
         position_m: (3,) centre of the ring in the stem's frame.
         flag_codes: Short names of the flags, in their order; see `Flag`.
         taper_cm_per_m: Loss of diameter per metre of stem; None where too little of the stem was seen.
+        rings: The stems in the section, the one measured first; empty for the paper's curves.
     """
 
     dbh_cm: float
@@ -155,6 +174,7 @@ class DbhEstimate:
     position_m: Float64
     flag_codes: tuple[str, ...] = ()
     taper_cm_per_m: float | None = None
+    rings: tuple[SectionRing, ...] = ()
 
     @property
     def hom_m(self) -> float:

@@ -10,22 +10,26 @@ from numpy.typing import NDArray
 
 from dbh_studio.core.arrays import Float64, as_points, readonly
 from dbh_studio.core.axis import StemAxis
+from dbh_studio.core.estimator.bark import bark_share
 from dbh_studio.core.estimator.circle import circle_tube
-from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, evidence_of, flags_of, oval_of, stem_beside
+from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, evidence_of, flags_of, oval_of
 from dbh_studio.core.estimator.fit import fit_tube
+from dbh_studio.core.estimator.heap import HeapSigns, heap_signs_of
 from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
 from dbh_studio.core.estimator.posterior import N_OUTLINE, Patches, Posterior, patches_of, posterior_of
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.result import EstimatorResult
+from dbh_studio.core.estimator.ring_count import MOST_STEMS, OtherStem, Stems, first_of, stems_of
 from dbh_studio.core.estimator.sample import sample_points
-from dbh_studio.core.estimator.search import find_rings
+from dbh_studio.core.estimator.search import search_rings
 from dbh_studio.core.estimator.tube import Tube, wave_basis
-from dbh_studio.core.measured import Diameter, Flag, Refusal
+from dbh_studio.core.measured import Diameter, Flag, Refusal, SectionRing
 from dbh_studio.core.robust import Circle
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
+_SURE_RING = 0.05  # standard deviation of a ring's points, relative to its radius, where none is told
 _LOOK = "Look at the stem: remove what is not bark, or delete it if it is no tree."
 _REMEDY = "Record the stem from its other side, or enter a tape value."
 
@@ -102,8 +106,8 @@ def assess_stem(
     if len(used) < settings.min_points:
         return Assessment(None, _too_few(heights, len(used), settings))
     local, origin = _local(used, settings, seed)
-    start = _start(local, settings, seed) if line is None or line.ring is None else _start_at(line, line.ring, origin)
-    found = _no_ring(local, settings) if start is None else _fitted(local, start, settings, seed)
+    stems = _stems(local, origin, line, settings, seed)
+    found = _no_ring(local, settings) if stems is None else _fitted(stems, settings, seed)
     if isinstance(found, Refusal):
         return Assessment(None, found)
     return _judged(found, origin, settings, _Told(scale_sd, drift_m))
@@ -124,11 +128,39 @@ def stem_line(
     if len(used) < settings.min_points:
         return None
     local, origin = _local(used, settings, seed)
-    start = _start(local, settings, seed)
-    if start is None:
+    stems = _started(local, settings, seed, most=2)
+    if stems is None:
         return None
+    start = stems.main
     centre = origin + np.array([*start.centre, 0.0])
     return StemAxis(centre, start.frame()[2], Circle(centre[:2], start.radius, start.sigma), "stem")
+
+
+def heap_signs(
+    points_m: NDArray[np.floating[Any]],
+    line: StemAxis,
+    radius_m: float,
+    *,
+    settings: EstimatorSettings = _DEFAULTS,
+    seed: int | None = None,
+) -> HeapSigns | None:
+    """What speaks for a heap in place of a stem about a ring that was found otherwise; None where too little is there.
+
+    Args:
+        points_m: (N, 3) points as for `estimate_diameter`.
+        line: Axis of the ring.
+        radius_m: Of the ring.
+        settings: Of the estimator.
+        seed: Of the sample.
+    """
+    used, _ = _window(as_points(points_m, name="points_m"), settings)
+    if len(used) < settings.min_points:
+        return None
+    local, origin = _local(used, settings, settings.seed if seed is None else seed)
+    ring = Circle(line.point_m[:2], radius_m, _SURE_RING * radius_m)
+    prior = StemPrior.from_settings(settings)
+    curve = fit_tube(local, _start_at(line, ring, origin), prior)
+    return None if curve is None else heap_signs_of(local, curve, prior)
 
 
 def _window(points: NDArray[np.floating[Any]], settings: EstimatorSettings) -> tuple[Float64, Float64]:
@@ -149,13 +181,23 @@ def _local(used: Float64, settings: EstimatorSettings, seed: int) -> tuple[Float
     return used[sample_points(used, settings.max_points, seed=seed)] - origin, origin
 
 
-def _start(local: Float64, settings: EstimatorSettings, seed: int) -> Tube | None:
-    """The likeliest ring; None where there is none."""
-    rng = np.random.default_rng([seed, 201])
-    rings, _ = find_rings(local, widest_m=settings.max_diameter_cm / 200.0, taper=settings.taper, rng=rng)
-    if not len(rings.radius):
+def _stems(
+    local: Float64, origin: Float64, line: StemAxis | None, settings: EstimatorSettings, seed: int
+) -> Stems | None:
+    """The stem to measure, and those beside it; None where nothing is round."""
+    if line is None or line.ring is None:
+        return _started(local, settings, seed)
+    first = _start_at(line, line.ring, origin)
+    return stems_of(local, first, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed)
+
+
+def _started(local: Float64, settings: EstimatorSettings, seed: int, *, most: int = MOST_STEMS) -> Stems | None:
+    """The same by a search of its own."""
+    rng, widest_m = np.random.default_rng([seed, 201]), settings.max_diameter_cm / 200.0
+    found = search_rings(local, widest_m=widest_m, taper=settings.taper, rng=rng)
+    if not len(found.rings.radius):
         return None
-    return Tube(rings.middles()[0], rings.slope[0], float(rings.radius[0]), 0.0, np.empty(0), float(rings.sigma[0]))
+    return stems_of(local, first_of(found), widest_m=widest_m, seed=settings.seed, most=most)
 
 
 def _start_at(line: StemAxis, ring: Circle, origin: Float64) -> Tube:
@@ -181,38 +223,45 @@ class _Found:
     patches: Patches
     evidence: Evidence
     method: str
+    signs: HeapSigns | None
+    others: tuple[OtherStem, ...] = ()
 
 
-def _fitted(local: Float64, start: Tube, settings: EstimatorSettings, seed: int) -> _Found | Refusal:
+def _fitted(stems: Stems, settings: EstimatorSettings, seed: int) -> _Found | Refusal:
     """Fit and posterior; the plain circle where the ring's fit fails."""
     prior = StemPrior.from_settings(settings)
     if settings.method == "ring":
-        found = _by("ring", local, start, prior, settings, seed)
+        found = _by("ring", stems, prior, settings, seed)
         if found is not None and oval_of(found.tube) > ODD_SHAPE:
             # A second stem may have been taken for a bulge of this one: a circle does not reach round both.
-            circle = _by("circle", local, start, prior, settings, seed)
-            widest_m = settings.max_diameter_cm / 200.0
-            if circle is not None and stem_beside(local, circle.tube, widest_m=widest_m, seed=settings.seed):
-                return circle
+            circle = _by("circle", stems, prior, settings, seed)
+            if circle is not None:
+                more = stems_of(
+                    stems.points, circle.tube, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed
+                ).others
+                if more:
+                    return replace(circle, others=(*stems.others, *more))
         if found is not None:
             return found
-    found = _by("circle", local, start, prior, settings, seed)
-    return _no_ring(local, settings) if found is None else found
+    found = _by("circle", stems, prior, settings, seed)
+    return _no_ring(stems.points, settings) if found is None else found
 
 
-def _by(
-    method: str, local: Float64, start: Tube, prior: StemPrior, settings: EstimatorSettings, seed: int
-) -> _Found | None:
+def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings, seed: int) -> _Found | None:
     """What one method finds; None where it finds nothing."""
-    is_ring = method == "ring"
-    tube = fit_tube(local, start, prior) if is_ring else circle_tube(local, start, prior, settings, seed=seed)
+    local, start, is_ring = stems.points, stems.main, method == "ring"
+    curve = fit_tube(local, start, prior)
+    tube = curve if is_ring else circle_tube(local, start, prior, settings, seed=seed)
     patches = None if tube is None else patches_of(local, tube, bloat_chance=settings.bloat_chance)
     if tube is None or patches is None:
         return None
     posterior = posterior_of(patches, tube, prior if is_ring else replace(prior, highest=1), seed=seed)
     tube = posterior.tube if is_ring else replace(tube, radius=tube.radius + patches.shift_m)
     evidence = evidence_of(local, tube)
-    return None if evidence is None else _Found(local, tube, posterior, patches, evidence, method)
+    if evidence is None:
+        return None
+    signs = None if curve is None else heap_signs_of(local, curve, prior)
+    return _Found(local, tube, posterior, patches, evidence, method, signs, stems.others)
 
 
 def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _Told) -> Assessment:
@@ -220,7 +269,8 @@ def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _
     logs = dict(found.posterior.quantiles)
     if found.method == "circle":  # its own radius, with the width of a round tube's posterior
         logs = {name: _moved_to(values, np.log(2.0 * found.tube.radius)) for name, values in logs.items()}
-    logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(settings.bark_share))
+    bark, _ = bark_share(found.points, found.tube, expected=settings.bark_share)
+    logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(bark))
     calibration = CALIBRATIONS[found.method]
     spreads = {name: _spread(values, found) for name, values in logs.items()}
     diameters = {name: _diameter(logs[name][1], calibration, spread, told) for name, spread in spreads.items()}
@@ -236,6 +286,10 @@ def _refusal(
     """Why a result may not be given; None where it may."""
     if found.evidence.is_heap(is_askew=found.method == "circle" and settings.axis == "vertical"):
         return _no_surface(settings)
+    if found.signs is not None and found.signs.chance > settings.max_clutter:
+        return _clutter(found.signs, settings)
+    if any(each.may_be_meant for each in found.others):
+        return _two_rings(found, settings)
     if spread.depth_noise > settings.max_depth_noise:
         return _too_shallow(found, spread)
     if not settings.min_diameter_cm <= chosen.value_cm <= settings.max_diameter_cm:
@@ -266,8 +320,9 @@ def _result(
         evidence,
         tube,
         lean_deg=lean,
-        beside=stem_beside(found.points, tube, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed),
+        beside=found.others,
         drift_chance=CALIBRATIONS[found.method].drift_chance(spread),
+        signs=found.signs,
     )
     if found.method != settings.method:
         words = "the closed curve had no hold, or reached round two stems: a plain circle was fitted"
@@ -291,6 +346,15 @@ def _result(
         spread=spread,
         log_sd=log_sd,
         flags=flags,
+        rings=_rings(found, origin),
+    )
+
+
+def _rings(found: _Found, origin: Float64) -> tuple[SectionRing, ...]:
+    """The stem measured, and those beside it."""
+    tubes = [(found.tube, found.evidence.n_points), *((each.tube, each.n_points) for each in found.others)]
+    return tuple(
+        SectionRing(readonly(origin[:2] + tube.centre), float(tube.radius), n_points) for tube, n_points in tubes
     )
 
 
@@ -352,6 +416,27 @@ def _no_surface(settings: EstimatorSettings) -> Refusal:
         f"The points about {settings.breast_height_m:.2f} m above ground fill the place evenly; no ring stands out.",
         _LOOK,
     )
+
+
+def _clutter(signs: HeapSigns, settings: EstimatorSettings) -> Refusal:
+    """Why what has a ring, but is none of bark, has no diameter."""
+    return Refusal(
+        "clutter",
+        f"What is {settings.breast_height_m:.2f} m above ground looks like a shrub, a heap or a thing: {signs.words}.",
+        "Delete it if it is no tree; if it is one, remove what is not bark, or enter a tape value.",
+    )
+
+
+def _two_rings(found: _Found, settings: EstimatorSettings) -> Refusal:
+    """Why a section in which no one ring is clearly the stem meant has no diameter."""
+    sizes = sorted((200.0 * tube.radius for tube in (found.tube, *(each.tube for each in found.others))), reverse=True)
+    said = ", ".join(f"{size:.0f}" for size in sizes[:-1]) + f" and {sizes[-1]:.0f} cm"
+    where = f"at {settings.breast_height_m:.2f} m above ground"
+    if any(each.kind == "fork" for each in found.others):
+        reason = f"The stem forks below: {len(sizes)} rings {where}, about {said} thick."
+        return Refusal("two_rings", reason, "Split it by stems and measure each, or measure below the fork.")
+    reason = f"{len(sizes)} rings {where}, about {said} thick; none of them is clearly the stem meant."
+    return Refusal("two_rings", reason, "Split it by stems, or remove the points of the other one.")
 
 
 def _too_uncertain(evidence: Evidence, chosen: Diameter) -> Refusal:

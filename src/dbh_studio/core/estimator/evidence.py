@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.estimator.fit import CUT, near_surface
+from dbh_studio.core.estimator.heap import LIKELY_CLUTTER, HeapSigns, clutter_flag
 from dbh_studio.core.estimator.posterior import N_OUTLINE
-from dbh_studio.core.estimator.search import find_rings, offsets
+from dbh_studio.core.estimator.ring_count import OtherStem
 from dbh_studio.core.estimator.tube import Polar, Tube
 from dbh_studio.core.measured import Flag
-from dbh_studio.core.section import ring_coverage
-
-Beside = Literal["", "neighbour", "fork"]
 
 ODD_SHAPE = 0.05
 """Outlines less round than this (see `oval_of`) may be two stems."""
@@ -24,7 +21,6 @@ _FULL_ARC_DEG = 300.0
 _GAP_DEG = 60.0
 _DRIFT_TO_MENTION = 0.75
 _FLUTED = 0.04  # of the fourth wave and up
-_FORK_DEPTH_M = 1.0  # below breast height
 _BIN_COUNTS = (36, 24, 18, 12)
 _POINTS_PER_BIN = 6
 _BIN_SHARE = 0.1
@@ -38,11 +34,7 @@ _FEW_POINTS = 100
 _LEAN_DEG = 10.0
 _SHORT_STRETCH_M = 0.4
 _OFF_M = 0.05
-_TOUCHING_M = 0.10
-_TOUCHING_ARC_DEG = 100.0
-_NEIGHBOURHOOD_M = 1.0
-_NEIGHBOUR_POINTS = 40
-_CLEAN_SHARE = 0.85
+_TOUCHING_M = 0.05
 # Made stems have a contrast of 0.6 and more and are filled up to 0.45; heaps without any ring have 0.4 and 1.1 in the
 # median.
 _LEAST_CONTRAST, _MOST_FILLED, _FULL = 0.45, 0.45, 0.7
@@ -122,7 +114,13 @@ def evidence_of(points: Float64, tube: Tube) -> Evidence | None:
 
 
 def flags_of(
-    evidence: Evidence, tube: Tube, *, lean_deg: float, beside: Beside, drift_chance: float
+    evidence: Evidence,
+    tube: Tube,
+    *,
+    lean_deg: float,
+    beside: tuple[OtherStem, ...],
+    drift_chance: float,
+    signs: HeapSigns | None,
 ) -> tuple[Flag, ...]:
     """What to look at, in words.
 
@@ -130,10 +128,13 @@ def flags_of(
         evidence: Of the tube.
         tube: As fitted.
         lean_deg: Of its axis.
-        beside: What stands against it, from `stem_beside`.
+        beside: The stems beside it, from `ring_count.stems_of`.
         drift_chance: That passes do not fit together, from `Calibration.drift_chance`.
+        signs: Of a heap.
     """
     flags = []
+    if signs is not None and signs.chance > LIKELY_CLUTTER:
+        flags.append(clutter_flag(signs))
     if evidence.arc_deg < _FULL_ARC_DEG:
         flags.append(Flag("partial_arc", f"only {evidence.arc_deg:.0f}° of the ring seen"))
     elif evidence.gap_deg > _GAP_DEG:
@@ -155,10 +156,7 @@ def flags_of(
         flags.append(
             Flag("not_at_height", f"the stem was seen only {100 * evidence.off_m:.0f} cm away from breast height")
         )
-    if beside == "neighbour":
-        flags.append(Flag("neighbour", "another stem touches it: see that the points are of this one"))
-    if beside == "fork":
-        flags.append(Flag("fork", "two stems that meet below: a fork; measure each, or below the fork"))
+    flags += _beside(beside)
     if evidence.n_points < _FEW_POINTS:
         flags.append(Flag("few_points", f"few points: {evidence.n_points}"))
     if lean_deg > _LEAN_DEG:
@@ -166,6 +164,20 @@ def flags_of(
     if evidence.stretch_m < _SHORT_STRETCH_M:
         flags.append(Flag("short_stretch", f"only {evidence.stretch_m:.1f} m of stem seen: lean and taper are guesses"))
     return tuple(flags)
+
+
+def _beside(others: tuple[OtherStem, ...]) -> list[Flag]:
+    """What to say of other stems in the section."""
+    if not others:
+        return []
+    sizes = " and ".join(f"{200.0 * each.tube.radius:.0f} cm" for each in others)
+    if any(each.kind == "fork" for each in others):
+        words = f"two stems that meet below breast height, the other {sizes} thick: a fork; split it and measure each"
+        return [Flag("fork", words)]
+    gap_m = min(each.gap_m for each in others)
+    how = "touches it" if gap_m < _TOUCHING_M else f"stands {100 * gap_m:.0f} cm beside it"
+    words = f"another stem, {sizes} thick, {how}: see that the points are of this one, or split it by stems"
+    return [Flag("neighbour", words)]
 
 
 def oval_of(tube: Tube) -> float:
@@ -249,33 +261,3 @@ def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
     # Points of one side share their error: a hundred of them tell as much as a few.
     n_told = min(here.sum(), elsewhere.sum()) / 10.0
     return height, float(1.25 * tube.sigma / np.sqrt(n_told))
-
-
-def stem_beside(points: Float64, tube: Tube, *, widest_m: float, seed: int) -> Beside:
-    """Whether what is outside the tube holds another clean ring that stands against it, and whether the two meet below.
-
-    Two axes that come together before the ground are one tree's that forks; those of neighbours do not.
-    """
-    at = tube.polar(points)
-    beyond = at.distance - tube.surface(at)
-    rest = points[(beyond > 3.0 * tube.sigma) & (beyond < _NEIGHBOURHOOD_M)]
-    if len(rest) < max(_NEIGHBOUR_POINTS, 0.12 * len(points)):
-        return ""
-    rings, _ = find_rings(rest, widest_m=widest_m, taper=0.0, rng=np.random.default_rng([seed, 203]))
-    if not len(rings.radius):
-        return ""
-    best = rings.at(slice(0, 1))
-    radius, sigma = float(best.radius[0]), float(best.sigma[0])
-    away = best.middles()[0] - tube.centre
-    apart = float(np.hypot(*away))
-    if apart < 0.8 * (radius + tube.radius) or apart > radius + tube.radius + _TOUCHING_M:
-        return ""
-    _, out_x, out_y, error = (part[0] for part in offsets(best, rest, 0.0))
-    on = np.abs(error) < 2.5 * sigma
-    around = error < 0.5 * radius
-    clean = on.sum() >= max(_NEIGHBOUR_POINTS, _CLEAN_SHARE * around.sum())
-    arc_deg, _ = ring_coverage(np.arctan2(out_y[on], out_x[on]))
-    if not (clean and sigma < 0.15 * radius and arc_deg >= _TOUCHING_ARC_DEG):
-        return ""
-    closer_per_m = float((best.slope[0] - tube.slope) @ away) / apart
-    return "fork" if apart - _FORK_DEPTH_M * closer_per_m < 0.5 * max(radius, tube.radius) else "neighbour"

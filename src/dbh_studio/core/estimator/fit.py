@@ -6,7 +6,9 @@ Three things keep what is not bark, or not where the bark is, from moving the ra
   front of the bark, shifts the mean and hardly the mode;
 - the width of the noise is taken from the points inside the median surface alone: clutter and tails lie outside;
 - patches of bark count, not points (`tube.cells_of`): the side that is seen a hundred times better does not decide
-  alone.
+  alone;
+- a point is held against the place on the bark that its error came from (`viewing`), which for what is seen at a
+  grazing angle is not the nearest one.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy as np
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.tube import Polar, Tube, cells_of, tukey
+from dbh_studio.core.estimator.viewing import OnBark, on_bark, viewing_of
 
 CUT = 3.0
 """Tukey's weights end at so many standard deviations."""
@@ -51,14 +54,20 @@ def fit_tube(points: Float64, start: Tube, prior: StemPrior, *, highest: int = 4
     Returns:
         None where fewer than ten points stay on it.
     """
-    tube = replace(start, taper=float(prior.mean_taper(start.radius)))
+    tube, viewing = replace(start, taper=float(prior.mean_taper(start.radius))), None
     for reach, rounds, order in ((0.30, 4, min(2, highest)), (np.inf, 6, highest)):
         window = points[np.abs(points[:, 2]) <= reach]
         if len(window) < 20:
             continue
         tube = replace(tube, waves=_padded(tube.waves, order))
         for turn in range(rounds):
-            moved = _improved(window, tube, prior, order, cut=CUT if turn else 1.3 * CUT)
+            near = near_surface(window, tube)
+            if near is None:
+                return None
+            if turn % 2 == 0:  # that changes little from step to step, and takes as long as a step
+                viewing = viewing_of(near.at, near.error, near.sigma)
+            bark = on_bark(near.at, near.error, tube, viewing)
+            moved = _improved(bark, near.sigma, tube, prior, order, cut=CUT if turn else 1.3 * CUT)
             if moved is None:
                 return None
             step = float(np.hypot(*(moved.centre - tube.centre)))
@@ -91,20 +100,17 @@ def _inner_sigma(error: Float64, radius: float) -> float | None:
     return float(np.clip(sigma, 0.002, min(0.045, 0.25 * radius + 0.003)))
 
 
-def _improved(points: Float64, tube: Tube, prior: StemPrior, highest: int, *, cut: float) -> Tube | None:
+def _improved(bark: OnBark, sigma: float, tube: Tube, prior: StemPrior, highest: int, *, cut: float) -> Tube | None:
     """One weighted least-squares step; None where too few points are left."""
-    near = near_surface(points, tube)
-    if near is None:
-        return None
-    weight = tukey(near.error, cut * near.sigma)
+    weight = tukey(bark.error, cut * sigma * np.sqrt(bark.variance))
     n_on = int((weight > 0.1).sum())
     if n_on < 10:
         return None
-    at = near.at
+    at = bark.at
     cell, n_cells = cells_of(at.angle(), at.along, tube.radius, n_on)
     crowd = np.bincount(cell, weight, n_cells)[cell] + 1e-9
-    shared = _SHARED_M**2 + (DRIFT * tube.radius * at.along) ** 2
-    weight = weight / (crowd * shared + near.sigma**2)
+    shared = _SHARED_M**2 * bark.variance + (DRIFT * tube.radius * at.along) ** 2
+    weight = weight / (crowd * shared + sigma**2 * bark.variance)
     design = at.design(highest)
     weighted = design * weight
     precision = prior.precision(tube.radius, highest)
@@ -115,7 +121,7 @@ def _improved(points: Float64, tube: Tube, prior: StemPrior, highest: int, *, cu
     target[2] -= precision[2] * (tube.slope @ u[:2])
     target[3] -= precision[3] * (tube.slope @ v[:2])
     target[5] += precision[5] * prior.mean_taper(tube.radius)
-    return _moved(tube, np.asarray(np.linalg.solve(normal, target), np.float64), near.sigma)
+    return _moved(tube, np.asarray(np.linalg.solve(normal, target), np.float64), sigma)
 
 
 def _moved(tube: Tube, found: Float64, sigma: float) -> Tube:

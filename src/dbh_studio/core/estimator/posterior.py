@@ -17,6 +17,7 @@ from dbh_studio.core.estimator.fit import CUT, DRIFT, near_surface
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.skew import surface_shift
 from dbh_studio.core.estimator.tube import Tube, cells_of, tukey, wave_basis
+from dbh_studio.core.estimator.viewing import on_bark, viewing_of
 
 N_OUTLINE = 72
 """Angles of the outline."""
@@ -80,11 +81,12 @@ def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0) -> Pat
     near = near_surface(points, tube)
     if near is None:
         return None
-    weight = tukey(near.error, CUT * tube.sigma)
+    bark = on_bark(near.at, near.error, tube, viewing_of(near.at, near.error, near.sigma))
+    weight = tukey(bark.error, CUT * tube.sigma * np.sqrt(bark.variance))
     on = weight > 0.02
     if on.sum() < 15:
         return None
-    at, error, weight = near.at.part(on), near.error[on], weight[on]
+    at, error, weight = bark.at.part(on), bark.error[on], weight[on]
     angle = at.angle()
     cell, n_cells = cells_of(angle, at.along, tube.radius, len(weight))
     total = np.bincount(cell, weight, n_cells)
@@ -95,7 +97,7 @@ def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0) -> Pat
     parts = np.stack([at.cos, at.sin, at.distance + shift, at.along])
     mean = np.stack([np.bincount(cell, weight * row, n_cells) for row in parts])[:, used] / total[used]
     off = np.bincount(cell, weight * error, n_cells)[used] / total[used]
-    noise = tube.sigma**2 / total[used]
+    noise = tube.sigma**2 * np.bincount(cell, weight * bark.variance[on], n_cells)[used] / total[used] ** 2
     spread = (1.4826 * float(np.median(np.abs(off - np.median(off))))) ** 2
     scatter = max(spread - float(np.median(noise)), _FLOOR_M**2)
     variance = _CORRELATED * (scatter + noise + (DRIFT * tube.radius * mean[3]) ** 2)

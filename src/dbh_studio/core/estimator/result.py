@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.estimator.interval import Spread
-from dbh_studio.core.measured import Diameter, Flag
+from dbh_studio.core.measured import Diameter, Flag, SectionRing
 from dbh_studio.core.transforms import Similarity
 
 
@@ -33,6 +33,7 @@ class EstimatorResult:
         spread: What the interval of the chosen diameter rests on.
         log_sd: Standard deviation of its logarithm, that of the scale included.
         flags: What to look at.
+        rings: All stems in the section, this one first.
     """
 
     diameters: dict[str, Diameter]
@@ -53,6 +54,7 @@ class EstimatorResult:
     spread: Spread
     log_sd: float
     flags: tuple[Flag, ...]
+    rings: tuple[SectionRing, ...] = ()
 
     @property
     def dbh_cm(self) -> float:

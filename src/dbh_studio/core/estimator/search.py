@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,13 +20,15 @@ _HYPOTHESES = 80  # per slice
 _SLICE_POINTS = 220
 _POINTS = 700
 _KEPT_PER_SLICE = 3
-_FINALISTS = 5
+_FINALISTS, _CANDIDATES = 5, 10
 _REACHES_M = np.array([0.12, 0.3, 0.7, np.inf])
 _TOLERANCES_M = (0.012, 0.03)
 _N_BINS = 24
 _INSIDE = 0.05  # density of clutter inside a stem, relative to outside
 _LEAN_SD = 0.12
+_OPAQUE = -3.5  # standard deviations below the surface from which on it is inside
 _SMALLEST_M = 0.01
+_APART = 0.8  # of the sum of their radii: nearer, two rings are two readings of one stem
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,22 @@ class Rings:
         return self.centre - self.slope * self.h0[:, None]
 
 
+class Search(NamedTuple):
+    """The likeliest rings, best first, and what two of them together would explain.
+
+    Attributes:
+        rings: H of them; none where nothing is round.
+        score: (H,) log-likelihood of all points, one stem supposed.
+        pair: Rows of the two that are likeliest as two stems beside each other; None where no two are apart.
+        gain: Log-likelihood of the two together, less that of the likeliest one, per point.
+    """
+
+    rings: Rings
+    score: Float64
+    pair: tuple[int, int] | None
+    gain: float
+
+
 def find_rings(points: Float64, *, widest_m: float, taper: float, rng: np.random.Generator) -> tuple[Rings, Float64]:
     """The likeliest rings, best first, and their log-likelihoods; none where nothing is round.
 
@@ -64,12 +83,23 @@ def find_rings(points: Float64, *, widest_m: float, taper: float, rng: np.random
         taper: Expected loss of radius, metres per metre, of stems thicker than 30 cm.
         rng: Source of the samples.
     """
+    found = search_rings(points, widest_m=widest_m, taper=taper, rng=rng)
+    return found.rings, found.score
+
+
+def search_rings(points: Float64, *, widest_m: float, taper: float, rng: np.random.Generator) -> Search:
+    """As `find_rings`, and whether two rings beside each other explain the points better than any one.
+
+    Where two thin stems touch, a wide ring round both may be likelier than either of them alone. So the two compete
+    with it together.
+    """
     low, high = np.quantile(points[:, 2], [0.01, 0.99])
     window = (max(float(low), -0.40), min(float(high), 0.50))
     start = _starts(points, window, widest_m, rng)
     if not len(start):
         nothing = np.empty(0)
-        return Rings(np.empty((0, 2)), np.empty((0, 2)), nothing, nothing, nothing), nothing
+        none = Rings(np.empty((0, 2)), np.empty((0, 2)), nothing, nothing, nothing)
+        return Search(none, nothing, None, 0.0)
     near = points[(points[:, 2] >= window[0]) & (points[:, 2] <= window[1])]
     used = near if len(near) >= 60 else points
     used = used if len(used) <= _POINTS else used[rng.permutation(len(used))[:_POINTS]]
@@ -78,12 +108,20 @@ def find_rings(points: Float64, *, widest_m: float, taper: float, rng: np.random
     rings = Rings(start[:, :2], np.zeros((len(start), 2)), start[:, 2], sigma, start[:, 3])
     rings = _refined(rings, some, (0.10, 0.14, 0.2, 0.3), widest_m, taper)
     area = _box_area(used[:, :2])
-    best = _distinct(rings, np.argsort(-_likelihood(rings, some, area, taper), kind="stable"), _FINALISTS)
+    told = _densities(rings, some, taper)
+    ranked = _distinct(rings, np.argsort(-_likelihood(told, area), kind="stable"), _CANDIDATES)
+    best = ranked[:_FINALISTS]
+    pair, _ = _best_pair(rings.at(ranked), told.at(ranked), area)
+    if pair is not None:
+        best = np.array([*best, *(ranked[row] for row in pair if row >= _FINALISTS)])
     rings = _refined(rings.at(best), used, (0.3, 0.45, np.inf, np.inf, np.inf), widest_m, taper)
-    score = _likelihood(rings, used, area, taper)
+    told = _densities(rings, used, taper)
+    score = _likelihood(told, area)
     order = np.argsort(-score, kind="stable")
-    order = _distinct(rings, order[np.isfinite(score[order])], _FINALISTS)
-    return rings.at(order), score[order]
+    order = _distinct(rings, order[np.isfinite(score[order])], len(order))
+    rings, score = rings.at(order), score[order]
+    pair, together = _best_pair(rings, told.at(order), area)
+    return Search(rings, score, pair, 0.0 if pair is None else (together - float(score[0])) / len(used))
 
 
 def _distinct(rings: Rings, order: Int64, n_most: int) -> Int64:
@@ -136,18 +174,26 @@ def _slice_circles(xy: Float64, n_hypotheses: int, widest_m: float, rng: np.rand
     circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] > _SMALLEST_M) & (circles[:, 2] < widest_m)]
     if not len(circles):
         return circles
-    score = _slice_score(x, y, circles)
-    kept: list[Float64] = []
-    for circle in circles[np.argsort(-score, kind="stable")[:40]]:
+    ranked = circles[np.argsort(-_slice_score(x, y, circles), kind="stable")]
+    kept = [ranked[0]]
+    for circle in ranked[1:40]:
         if all(_apart(circle, other) > 0.3 * min(circle[2], other[2]) for other in kept):
             kept.append(circle)
             if len(kept) == _KEPT_PER_SLICE:
                 break
+    # And one beside the best, for it may be another stem's.
+    beside = np.hypot(*(ranked[:, :2] - ranked[0, :2]).T) > _APART * (ranked[:, 2] + ranked[0, 2])
+    if beside.any() and not any(_is_beside(circle, kept[0]) for circle in kept[1:]):
+        kept[_KEPT_PER_SLICE - 1 :] = [ranked[int(beside.argmax())]]
     return np.array(kept)
 
 
 def _apart(one: Float64, other: Float64) -> float:
     return float(np.hypot(one[0] - other[0], one[1] - other[1]) + abs(one[2] - other[2]))
+
+
+def _is_beside(one: Float64, other: Float64) -> bool:
+    return bool(np.hypot(one[0] - other[0], one[1] - other[1]) > _APART * (one[2] + other[2]))
 
 
 def _slice_score(x: Float64, y: Float64, circles: Float64) -> Float64:
@@ -215,8 +261,25 @@ def _step(slope: Float64, sigma: Float64, weight: Float64, total: Float64, place
     return step
 
 
-def _likelihood(rings: Rings, points: Float64, area: float, taper: float) -> Float64:
-    """(H,) log-likelihood of all points; -inf for a ring of fewer than ten."""
+class _Densities(NamedTuple):
+    """What H rings say of N points.
+
+    Attributes:
+        ring: (H, N) density, if all points were the ring's.
+        ratio: (H, N) distance to the ring, in standard deviations.
+        n_on: (H,) how many points are on it.
+    """
+
+    ring: Float64
+    ratio: Float64
+    n_on: Int64
+
+    def at(self, rows: Int64) -> _Densities:
+        """Of some of the rings."""
+        return _Densities(self.ring[rows], self.ratio[rows], self.n_on[rows])
+
+
+def _densities(rings: Rings, points: Float64, taper: float) -> _Densities:
     _, out_x, out_y, error = offsets(rings, points, taper)
     sigma = np.maximum(rings.sigma, 0.004)[:, None]
     ratio = error / sigma
@@ -228,7 +291,31 @@ def _likelihood(rings: Rings, points: Float64, area: float, taper: float) -> Flo
     share = share / share.sum(axis=1, keepdims=True)
     # The arc that is really covered: a ring only explains what lies where its points are.
     arc_m = np.exp(-(share * np.log(share)).sum(axis=1)) * (2 * np.pi / _N_BINS) * rings.radius
-    part = (n_on / len(points))[:, None]
-    ring = part * np.exp(-0.5 * ratio * ratio) / (2.5066 * sigma * arc_m[:, None])
-    clutter = np.where(ratio < -3.5, _INSIDE, 1.0) * (1.02 - part) / area
-    return np.where(n_on >= 10, np.log(ring + clutter).sum(axis=1), -np.inf)
+    return _Densities(np.exp(-0.5 * ratio * ratio) / (2.5066 * sigma * arc_m[:, None]), ratio, n_on)
+
+
+def _likelihood(told: _Densities, area: float) -> Float64:
+    """(H,) log-likelihood of all points; -inf for a ring of fewer than ten."""
+    share = (told.n_on / told.ratio.shape[1])[:, None]
+    clutter = np.where(told.ratio < _OPAQUE, _INSIDE, 1.0) * (1.02 - share) / area
+    return np.where(told.n_on >= 10, np.log(share * told.ring + clutter).sum(axis=1), -np.inf)
+
+
+def _best_pair(rings: Rings, told: _Densities, area: float) -> tuple[tuple[int, int] | None, float]:
+    """The two rings, apart from each other, that explain the points best together, and their log-likelihood."""
+    one, other = np.triu_indices(len(rings.radius), 1)
+    place = rings.middles()
+    apart = np.hypot(*(place[one] - place[other]).T) > _APART * (rings.radius[one] + rings.radius[other])
+    fit = apart & (np.minimum(told.n_on[one], told.n_on[other]) >= 10)
+    if not fit.any():
+        return None, -np.inf
+    one, other = one[fit], other[fit]
+    off, off_other = np.abs(told.ratio[one]), np.abs(told.ratio[other])
+    # A point on both counts for the nearer: else a small ring laid over a stretch of bark would count it twice.
+    share = ((off < 3.0) & (off <= off_other)).mean(axis=1)[:, None]
+    share_other = ((off_other < 3.0) & (off_other < off)).mean(axis=1)[:, None]
+    inside = (told.ratio[one] < _OPAQUE) | (told.ratio[other] < _OPAQUE)
+    clutter = np.where(inside, _INSIDE, 1.0) * (1.02 - share - share_other) / area
+    score = np.log(share * told.ring[one] + share_other * told.ring[other] + clutter).sum(axis=1)
+    best = int(score.argmax())
+    return (int(one[best]), int(other[best])), float(score[best])

@@ -23,7 +23,7 @@ _SCALES = np.array([0.5, 0.65, 0.8, 1.0, 1.25])  # noise over the width of the i
 _SHIFTS = np.linspace(-2.5, 0.75, 27)
 _LOWEST, _BIN, _N_BINS = -5.0, 0.25, 52
 _CLUTTER = 0.05
-_TOLD = 250.0  # points share their errors: more of them tell no more
+_TOLD = 600.0  # points share their errors: more of them tell no more
 _FINE = 0.05
 
 
