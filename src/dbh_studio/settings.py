@@ -13,6 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from dbh_studio.errors import SettingError
 
 CurveName = Literal["shrinkage", "circle", "fourier", "ellipse", "bspline"]
+SlopeBase = Literal["uphill", "midpoint", "downhill"]
+HeightAlong = Literal["vertical", "stem"]
+MeasureAbove = Literal["nothing", "bulge", "buttress"]
 
 
 def setting(default: Any, title: str, *, unit: str = "", help: str = "", **bounds: Any) -> Any:
@@ -193,6 +196,20 @@ class MeasureSettings(SettingsModel):
         le=5.0,
         help="1.30 Europe and Canada, 1.37 USA (4.5 ft), 1.40 New Zealand",
     )
+    base: SlopeBase = setting(
+        "midpoint",
+        "Base on a slope",
+        help="where the height is measured from: the ground on the stem's uphill or downhill side, or their mean",
+    )
+    along: HeightAlong = setting(
+        "vertical", "Height of a leaning stem", help="vertical: above the base; stem: along the stem's axis"
+    )
+    above: MeasureAbove = setting(
+        "nothing",
+        "Measure above",
+        help="bulge: where the stem is swollen at breast height, measure where that ends; buttress: also above a "
+        "buttress or root swell that reaches breast height; nothing: at breast height whatever is there",
+    )
     band_below_m: float = setting(
         0.08,
         "Band below",
@@ -321,7 +338,7 @@ class EstimatorSettings(SettingsModel):
         "Bark under the tape",
         ge=0.0,
         le=0.1,
-        help="a tape lies on the bark's ridges, a curve runs through their middle; relative to the diameter",
+        help="expected share of the diameter by which a tape on the ridges exceeds the curve; visible bark decides",
     )
     bloat_chance: float = setting(
         0.05, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared outwards, before looking; 0: never"
@@ -336,6 +353,9 @@ class EstimatorSettings(SettingsModel):
     )
     max_depth_noise: float = setting(
         0.15, "Most noise of an arc", gt=0.0, le=10.0, help="scatter over the depth of the arc seen; more is refused"
+    )
+    max_clutter: float = setting(
+        0.9, "Most like clutter", gt=0.0, le=1.0, help="chance of being no stem; with more it is refused; 1: never"
     )
     min_diameter_cm: float = setting(2.0, "Smallest diameter", unit="cm", ge=0.5, le=100.0)
     max_diameter_cm: float = setting(250.0, "Largest diameter", unit="cm", ge=10.0, le=1500.0)

@@ -155,7 +155,30 @@ def test_columns_are_a_promise():
     assert ",".join(COLUMNS) == (
         "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_lo_cm,dbh_hi_cm,dbh_method,dbh_definition,"
         "dbh_tape_cm,dbh_tape_lo_cm,dbh_tape_hi_cm,dbh_curve_cm,dbh_curve_lo_cm,dbh_curve_hi_cm,"
-        "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,hom_m,coverage_deg,max_gap_deg,"
+        "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,tree_dbh_cm,hom_m,breast_height_m,base,along,above,coverage_deg,max_gap_deg,"
         "rmse_mm,n_points,lean_deg,taper_cm_per_m,quality,flags,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,note,"
         "health,crown_class,field_tape_cm,field_tape_height_m,corrections,review,easting,northing,epsg"
     )
+
+
+def grouped(*stems):
+    """(dbh_cm or None, tree) each."""
+    refusal = Refusal("small_arc", "Only 80° of the ring seen.", "Walk round it.")
+    return Inventory.of(
+        make_row(refusal if cm is None else make_estimate(dbh_cm=cm), stem_id=i, record=TreeRecord(tree_id=tree))
+        for i, (cm, tree) in enumerate(stems, start=1)
+    ).rows
+
+
+def test_the_diameter_of_a_tree_is_the_root_of_the_sum_of_squares_of_its_stems():
+    rows = grouped((30.0, 1), (40.0, 1), (25.0, None))
+    assert [row.tree_dbh_cm for row in rows] == pytest.approx([50.0, 50.0, 25.0])
+    assert [row.reason for row in rows] == ["", "", ""]
+
+
+def test_a_stem_without_a_diameter_leaves_the_tree_without_one_and_says_so():
+    rows = grouped((30.0, 2), (None, 2), (20.0, 2), (None, None))
+    assert [row.tree_dbh_cm for row in rows] == [None] * 4
+    assert rows[0].dbh_cm == 30.0
+    assert rows[0].reason == rows[2].reason == "tree 2 has no diameter as a whole, because stem 2 has none"
+    assert rows[1].reason == rows[3].reason == "Only 80° of the ring seen."

@@ -83,8 +83,12 @@ def test_imperial_is_the_same_stand():
 
 
 def test_thin_stems_may_be_left_out_but_those_without_a_number_are_counted():
-    total = stand_table(STEMS, PlotArea.circle((0, 0), 5.0), least_dbh_cm=12).total
-    assert (total.n_stems, total.n_refused) == (4, 1)
+    table = stand_table(STEMS, PlotArea.circle((0, 0), 5.0), least_dbh_cm=12)
+    assert (table.total.n_stems, table.total.n_refused) == (4, 1)
+    assert (table.least_dbh_cm, table.n_thin) == (
+        12,
+        stand_table(STEMS, PlotArea.circle((0, 0), 5.0)).total.n_stems - 4,
+    )
 
 
 def test_polygons_hold_what_is_inside_also_far_from_the_origin():
@@ -106,6 +110,7 @@ def test_polygons_hold_what_is_inside_also_far_from_the_origin():
         lambda: PlotArea.polygon([(0, 0), (1, 1), (2, 2)]),
         lambda: PlotArea.extent(np.full((3, 2), math.nan)),
         lambda: stand_table(STEMS, PlotArea.circle((0, 0), 1), class_width=0),
+        lambda: stand_table(STEMS, PlotArea.circle((0, 0), 5), class_width=1e-4),
     ],
 )
 def test_a_plot_that_is_none_is_refused(make):
@@ -121,3 +126,31 @@ def test_a_plot_without_stems_has_no_means():
     assert (
         only_refused.total.n_refused == 1 and only_refused.total.mean is None and only_refused.total.basal_area is None
     )
+
+
+def test_per_tree_a_multi_stem_tree_counts_once_with_its_own_diameter():
+    """10² + 10² = 14.14² cm; the basal area is that of the stems."""
+    plot = PlotArea.circle((0, 0), 5.0)
+    stems, trees = stand_table(STEMS, plot), stand_table(STEMS, plot, per="tree")
+    assert (stems.per, trees.per) == ("stem", "tree")
+    assert (trees.total.n_trees, trees.total.n_stems, trees.total.n_refused, trees.n_outside) == (5, 6, 1, 2)
+    assert trees.total.stems_per_area == pytest.approx(stems.total.stems_per_area * 5 / 6)
+    assert trees.total.basal_area == pytest.approx(stems.total.basal_area)
+    assert trees.total.qmd == pytest.approx(math.sqrt((400 + 1600 + 900 + 200) / 4))
+    assert trees.total.least == pytest.approx(math.sqrt(200))
+    ash = next(row for row in trees.rows if row.species == "ash")
+    assert (ash.n_trees, ash.n_stems) == (1, 2) and sum(ash.classes) == pytest.approx(ash.stems_per_area)
+
+
+def test_per_tree_a_stem_without_a_diameter_leaves_its_tree_without():
+    inventory = rows((30.0, 0, 0, "", 4), (None, 1, 0, "oak", 4), (20.0, 2, 0, "ash", None))
+    table = stand_table(inventory, PlotArea.circle((0, 0), 5.0), per="tree")
+    assert (table.total.n_trees, table.total.n_stems, table.total.n_refused) == (2, 3, 1)
+    assert table.total.greatest == 20.0
+    assert [row.species for row in table.rows] == ["ash", "oak"]
+
+
+def test_per_tree_the_place_is_the_mean_of_the_stems():
+    inventory = rows((30.0, 0, 0, "", 1), (30.0, 4, 0, "", 1))
+    assert stand_table(inventory, PlotArea.circle((0, 0), 3.0), per="tree").total.n_trees == 1
+    assert stand_table(inventory, PlotArea.circle((0, 0), 1.0), per="tree").n_outside == 1

@@ -94,3 +94,20 @@ def test_a_collar_that_a_curve_in_a_band_believes_is_caught_by_the_stem():
     assert fourier.dbh_cm > 48.0
     flag = breast_height_flag(stem_profile(points, settings=SMOOTH), fourier.hom_m, fourier.diameters["tape"])
     assert flag is not None and "thicker" in flag.words
+
+
+def test_the_scales_error_excuses_no_difference_between_the_diameters_of_one_stem():
+    """A weakly scaled cloud: every diameter may be 20 % off, but all by the same."""
+    half = 1.645 * np.hypot(0.02, 0.12)
+    weak = Diameter(47.0, 47.0 * (1 - half), 47.0 * (1 + half))
+    assert breast_height_flag(straight(), 1.3, weak) is None
+    flag = breast_height_flag(straight(), 1.3, weak, scale_sd=0.12)
+    assert flag is not None and flag.code == "profile"
+    points = stem(taper=0.0)
+    points[np.abs(points[:, 2] - 1.37) < 0.2, :2] *= 1.25
+    circle = measure_stem(points, settings=SMOOTH.changed(curve="circle"), scale_sd=0.12)
+    half = circle.diameters["tape"].half_width
+    told = Diameter(50.0, 50.0 * (1 - half), 50.0 * (1 + half))
+    profile = stem_profile(points, settings=SMOOTH, scale_sd=0.12)
+    assert breast_height_flag(profile, 1.3, told, scale_sd=0.12) is not None
+    assert breast_height_flag(profile, 1.3, told) is None

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dbh_studio.core.dbh import DbhEstimate, Refusal
+from dbh_studio.core.protocols import Protocol
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import CancelledError
 from dbh_studio.settings import MeasureSettings
@@ -221,3 +222,34 @@ def test_trunk_type_is_what_the_plot_holds():
     trunk = Trunk(1, np.arange(5000))
     found = measure_all(TrunkSet((trunk,)), lambda trunk: stem()[trunk.points], ground=Slope())
     assert found[1].n_points == len(trunk)
+
+
+def contact_heights(radius, lean_deg, rise):
+    """Heights at which lines on a leaning cylinder's surface meet ground that rises along x, by formula."""
+    lean, angle = np.radians(lean_deg), np.linspace(0, 2 * np.pi, 3600)
+    u, w = np.array([np.cos(lean), 0, -np.sin(lean)]), np.array([np.sin(lean), 0, np.cos(lean)])
+    start = radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * np.array([0.0, 1.0, 0.0]))
+    along = (rise * start[:, 0] - start[:, 2]) / (w[2] - rise * w[0])
+    return start[:, 2] + along * w[2]
+
+
+@pytest.mark.parametrize("lean_deg", [0.0, 15.0, -20.0])
+@pytest.mark.parametrize("rise", [0.3, -0.6])
+@pytest.mark.parametrize("base", ["uphill", "midpoint", "downhill"])
+def test_heights_count_from_the_side_of_the_slope_that_is_asked_for(base, rise, lean_deg):
+    heights = contact_heights(0.2, lean_deg, rise)
+    expected = {"uphill": heights.max(), "downhill": heights.min(), "midpoint": (heights.max() + heights.min()) / 2}
+    points = stem(x=5, base=5 * rise, lean_deg=lean_deg, n=8000)
+    found = measured(points, Slope(rise=rise), settings=SMOOTH.changed(base=base))
+    assert found.z_ground_m == pytest.approx(5 * rise + expected[base], abs=0.01)
+    assert found.result.hom_m == pytest.approx(1.30)
+    section_z = found.z_ground_m + found.result.hom_m
+    assert found.xy_m[0] == pytest.approx(5 + (section_z - 5 * rise) * np.tan(np.radians(lean_deg)), abs=0.01)
+    assert found.protocol == Protocol(1.30, base, "vertical", "nothing")
+
+
+def test_what_is_placed_goes_before_the_slope_and_is_told():
+    points = stem(x=5, base=2.5)
+    found = measured(points, Slope(rise=0.5), settings=SMOOTH.changed(base="uphill"), z_ground_m=2.8)
+    assert found.z_ground_m == 2.8 and found.protocol.base == "placed"
+    assert measured(stem(), Slope(kind="stem_base")).protocol.base == "stem"

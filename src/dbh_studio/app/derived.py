@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING, Generic, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, get_args
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,6 +20,7 @@ from dbh_studio.core.arrays import Float32, readonly
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import Inventory, InventoryRow, MapPosition, inventory_row
 from dbh_studio.core.progress import Progress, ignore_progress
+from dbh_studio.core.protocols import StemSetup, setup_key, stem_setup
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.core.trunks import Trunk
 from dbh_studio.settings import CurveName
@@ -89,8 +90,23 @@ def _ground_key(document: Document) -> Hashable:
     return _frame_key(document), document.settings.ground
 
 
-def _measure_key(document: Document) -> Hashable:
-    return _ground_key(document), document.settings.measure, document.scale.relative_sd
+def _measure_key(document: Document, trunk_id: int) -> Hashable:
+    corrections = document.record(trunk_id).corrections
+    return _ground_key(document), setup_key(corrections, document.settings.measure), document.scale.relative_sd
+
+
+def stem_setup_of(document: Document, trunk_id: int) -> StemSetup:
+    """How a stem of a plot is measured: as the plot, and as was said of this stem.
+
+    Raises:
+        KeyError: There is no such trunk.
+    """
+    return stem_setup(
+        document.record(trunk_id).corrections,
+        document.settings.measure,
+        points=document.trunks[trunk_id].points,
+        world_from_source=document.world_from_source,
+    )
 
 
 class Derived:
@@ -175,13 +191,13 @@ class Derived:
         """The measurement of a stem if it is there already."""
         with self._lock:
             recent = self._stems.get(document.trunks[trunk_id])
-            return recent.get(_measure_key(document)) if recent is not None else None
+            return recent.get(_measure_key(document, trunk_id)) if recent is not None else None
 
     def put_measurement(self, document: Document, measurement: StemMeasurement) -> StemMeasurement:
         """Remember a stem that was measured with the ground and settings of `document`."""
         with self._lock:
             recent = self._stems.setdefault(document.trunks[measurement.trunk_id], _Recent(_N_MEASUREMENTS))
-            return recent.put(_measure_key(document), measurement)
+            return recent.put(_measure_key(document, measurement.trunk_id), measurement)
 
     def measurement(self, document: Document, trunk_id: int) -> StemMeasurement:
         """The diameter of one stem, or why there is none.
@@ -195,15 +211,7 @@ class Derived:
         known = self.known_measurement(document, trunk_id)
         if known is not None:
             return known
-        measure_trunk = self._measure_trunk or _default_measure_trunk()
-        measurement = measure_trunk(
-            self.points_world(document)[trunk.points],
-            trunk_id=trunk_id,
-            ground=self.ground(document),
-            settings=document.settings.measure,
-            scale_sd=document.scale.relative_sd,
-        )
-        return self.put_measurement(document, measurement)
+        return self.put_measurement(document, self._measured(document, trunk))
 
     def compared(self, document: Document, trunk_id: int) -> StemMeasurement:
         """The diameter of one stem with every method's curve beside it; measured anew.
@@ -214,14 +222,19 @@ class Derived:
         trunk = document.trunks[trunk_id]
         if not document.scale.is_known:
             return _unscaled(trunk)
+        return self._measured(document, trunk, curves=get_args(CurveName))
+
+    def _measured(self, document: Document, trunk: Trunk, **options: Any) -> StemMeasurement:
         measure_trunk = self._measure_trunk or _default_measure_trunk()
+        setup = stem_setup_of(document, trunk.id)
         return measure_trunk(
-            self.points_world(document)[trunk.points],
-            trunk_id=trunk_id,
+            setup.measured(self.points_world(document)[trunk.points]),
+            trunk_id=trunk.id,
             ground=self.ground(document),
-            settings=document.settings.measure,
-            curves=get_args(CurveName),
+            settings=setup.settings,
             scale_sd=document.scale.relative_sd,
+            **setup.placed,
+            **options,
         )
 
     def profile(self, document: Document, trunk_id: int) -> tuple[ProfilePoint, ...]:
@@ -235,10 +248,11 @@ class Derived:
             return ()
         from dbh_studio.stages.measure import profile_trunk
 
+        setup = stem_setup_of(document, trunk_id)
         return profile_trunk(
-            self.points_world(document)[document.trunks[trunk_id].points],
+            setup.measured(self.points_world(document)[document.trunks[trunk_id].points]),
             z_ground_m=z_ground_m,
-            settings=document.settings.measure,
+            settings=setup.settings,
             scale_sd=document.scale.relative_sd,
         )
 
@@ -258,7 +272,8 @@ class Derived:
             if self._inventory is not None and self._inventory[0] is document:
                 return self._inventory[1]
         stems = self.measurements(document, progress)
-        inventory = Inventory.of(self._row(document, stem) for stem in stems)
+        own = {i: record.fields for i, record in document.trees.items()}
+        inventory = Inventory.of((self._row(document, stem) for stem in stems), own)
         with self._lock:
             self._inventory = document, inventory
         return inventory
@@ -275,6 +290,7 @@ class Derived:
             scale=document.scale,
             edited=trunk.origin == "hand",
             position=self._position(document, stem),
+            protocol=stem.protocol,
         )
 
     def _position(self, document: Document, stem: StemMeasurement) -> MapPosition | None:
@@ -314,4 +330,5 @@ def _unscaled(trunk: Trunk) -> StemMeasurement:
         z_ground_m=float("nan"),
         n_points=len(trunk),
         ground_kind="stem_base",
+        protocol=None,
     )

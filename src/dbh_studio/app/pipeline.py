@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbh_studio.app.commands import change_settings, rename_plot, replace_trunks
+from dbh_studio.app.derived import stem_setup_of
 from dbh_studio.app.document import Direction, Document
 from dbh_studio.app.jobs import run_job
 from dbh_studio.app.last_search import apply_search
@@ -27,12 +28,13 @@ from dbh_studio.app.session import Session
 from dbh_studio.app.threads import CallAhead, map_in_threads
 from dbh_studio.core.arrays import Float32
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
+from dbh_studio.core.protocols import StemSetup
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import CommandError, ProjectError, ProjectExistsError
 from dbh_studio.io.inventory_csv import check_absent, check_not_source, check_replaceable, write_inventory_csv
 from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
-from dbh_studio.settings import GroundSettings, MeasureSettings, Settings
+from dbh_studio.settings import GroundSettings, Settings
 
 if TYPE_CHECKING:
     from dbh_studio.app.brought_masks import MaskSet, VotingMasks
@@ -215,18 +217,25 @@ def segment(
 
 
 def measure_stems(
-    stems: Sequence[tuple[int, Float32]],
+    stems: Sequence[tuple[int, Float32, StemSetup]],
     ground: GroundModel,
-    settings: MeasureSettings,
     scale_sd: float = 0.0,
     *,
     progress: Progress = ignore_progress,
 ) -> list[StemMeasurement]:
-    """Measure many stems, given as (id, (K, 3) points_world). Pure and picklable, for a job."""
+    """Measure many stems, given as (id, (K, 3) points_world, how). Pure and picklable, for a job."""
     from dbh_studio.stages.measure import measure_trunk
 
-    def measure(stem: tuple[int, Float32]) -> StemMeasurement:
-        return measure_trunk(stem[1], trunk_id=stem[0], ground=ground, settings=settings, scale_sd=scale_sd)
+    def measure(stem: tuple[int, Float32, StemSetup]) -> StemMeasurement:
+        trunk_id, points, setup = stem
+        return measure_trunk(
+            setup.measured(points),
+            trunk_id=trunk_id,
+            ground=ground,
+            settings=setup.settings,
+            scale_sd=scale_sd,
+            **setup.placed,
+        )
 
     measured: list[StemMeasurement] = []
     progress(0.0, "Measuring the stems")
@@ -255,8 +264,9 @@ def measurement_call(session: Session, document: Document) -> tuple[Any, ...]:
     Give the result to ``session.remember_measurements(document, result)``; it is right whatever happened meanwhile.
     """
     points_world = session.points_world(document)
-    stems = [(i, points_world[document.trunks[i].points]) for i in session.unmeasured(document)]
-    return stems, session.ground(document=document), document.settings.measure, document.scale.relative_sd
+    trunks = document.trunks
+    stems = [(i, points_world[trunks[i].points], stem_setup_of(document, i)) for i in session.unmeasured(document)]
+    return stems, session.ground(document=document), document.scale.relative_sd
 
 
 # ---- all at once

@@ -49,6 +49,22 @@ def add_settings_options(parser: argparse.ArgumentParser, *, only_measure: bool 
         help="method the diameter is read by; shrinkage and circle give an interval",
     )
     parser.add_argument("--breast-height", type=float, metavar="M", help="1.30, 1.37 (4.5 ft), 1.40 or another, metres")
+    parser.add_argument(
+        "--protocol",
+        choices=("paper", "fao", "fia", "champion", "nz"),
+        help="breast height, --base, --along and --above by the rules of a manual; what is given beside it goes before",
+    )
+    parser.add_argument(
+        "--base", choices=("uphill", "midpoint", "downhill"), help="side of a slope that breast height is measured from"
+    )
+    parser.add_argument(
+        "--along", choices=("vertical", "stem"), help="height above the base, or along the axis of a leaning stem"
+    )
+    parser.add_argument(
+        "--above",
+        choices=("nothing", "bulge", "buttress"),
+        help="what is measured above where it reaches breast height; buttress: bulges too",
+    )
     if not only_measure:
         parser.add_argument("--ground", choices=("terrain", "plane"), help="terrain, or the paper's single plane")
     example = "measure.definition=tape" if only_measure else "trunks.min_diameter_cm=8"
@@ -301,9 +317,16 @@ def settings_changes(options: argparse.Namespace, *, only_measure: bool = False)
     from dbh_studio.settings import Settings
 
     changes: dict[str, dict[str, Any]] = {}
+    if options.protocol is not None:
+        from dbh_studio.core.protocols import PROTOCOLS
+
+        changes["measure"] = dict(PROTOCOLS[options.protocol])
     for section, name, value in (
         ("measure", "curve", options.curve),
         ("measure", "breast_height_m", options.breast_height),
+        ("measure", "base", options.base),
+        ("measure", "along", options.along),
+        ("measure", "above", options.above),
         ("ground", "method", getattr(options, "ground", None)),
     ):
         if value is not None:

@@ -6,7 +6,9 @@ import argparse
 import csv
 import io
 import json
+import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -21,19 +23,22 @@ from dbh_studio.cli.common import (
     settings_changes,
     unscaled_error,
 )
-from dbh_studio.errors import FileError, StudioError, UnscaledCloudError
+from dbh_studio.errors import FileError, SettingError, StudioError, UnscaledCloudError
 
 if TYPE_CHECKING:
     from dbh_studio.core.arrays import Float64
     from dbh_studio.core.dbh import DbhEstimate, Refusal
+    from dbh_studio.core.protocols import Protocol
+    from dbh_studio.core.stem_profile import ProfilePoint
     from dbh_studio.settings import MeasureSettings
 
-PROFILE_COLUMNS = ("file", "height_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "coverage_deg", "reason")
+PROFILE_COLUMNS = ("file", "stem_id", "height_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "coverage_deg", "reason")
 COLUMNS = (
-    "file", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "dbh_method", "dbh_definition",
+    "file", "stem_id", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "dbh_method", "dbh_definition",
     "dbh_tape_cm", "dbh_tape_lo_cm", "dbh_tape_hi_cm", "dbh_curve_cm", "dbh_curve_lo_cm", "dbh_curve_hi_cm",
-    "dbh_area_cm", "dbh_area_lo_cm", "dbh_area_hi_cm", "hom_m", "coverage_deg", "max_gap_deg", "rmse_mm", "n_points",
-    "lean_deg", "taper_cm_per_m", "quality", "reason", "remedy", "flags",
+    "dbh_area_cm", "dbh_area_lo_cm", "dbh_area_hi_cm", "hom_m", "breast_height_m", "base", "along", "above",
+    "coverage_deg", "max_gap_deg", "rmse_mm", "n_points", "lean_deg", "taper_cm_per_m",
+    "quality", "reason", "remedy", "flags", "corrections",
     "shrinkage_cm", "circle_cm", "fourier_cm", "ellipse_cm", "bspline_cm",
 )  # fmt: skip
 
@@ -42,12 +47,14 @@ def add_commands(commands: Any) -> None:
     """Register the command."""
     measure = commands.add_parser(
         "measure",
-        help="measure stems that are already cut out, one file each",
-        description="Measure stems that are already cut out, one file each, and print a CSV table. A file that cannot "
-        "be read is reported and the others are measured all the same (status 1; 3 where a scale is missing). A stem "
-        "that cannot be measured is no error: its row says why.",
+        help="measure stems that are already cut out, one file each, or those of a saved plot",
+        description="Measure stems that are already cut out, one file each, or all stems of a saved plot as it says, "
+        "and print a CSV table. A file that cannot be read is reported and the others are measured all the same "
+        "(status 1; 3 where a scale is missing). A stem that cannot be measured is no error: its row says why.",
     )
-    measure.add_argument("stems", type=path_argument, nargs="+", metavar="STEM", help="a cloud of one stem")
+    measure.add_argument(
+        "stems", type=path_argument, nargs="+", metavar="STEM", help="a cloud of one stem, or a saved NAME.dbh"
+    )
     measure.add_argument(
         "--csv", type=path_argument, metavar="OUT", help="write the table there instead of printing it"
     )
@@ -75,7 +82,8 @@ def measure_files(options: argparse.Namespace) -> int:
     """Measure each file; one that cannot be read is reported and the others go on."""
     from dbh_studio.settings import Settings
 
-    settings = Settings().measure.changed(**settings_changes(options, only_measure=True).get("measure", {}))
+    changes = settings_changes(options, only_measure=True).get("measure", {})
+    settings = Settings().measure.changed(**changes)
     if options.csv is not None:
         from dbh_studio.io.inventory_csv import check_not_source
 
@@ -88,8 +96,8 @@ def measure_files(options: argparse.Namespace) -> int:
     with progress_for(options) as progress:
         for number, path in enumerate(options.stems):
             progress(number / len(options.stems), path.name)
-            row, error, along = _row(path, options, settings)
-            rows.append(row)
+            found, error, along = _rows(path, options, settings, changes)
+            rows += found
             profile += along
             if error is not None:
                 errors.append(error)
@@ -104,18 +112,24 @@ def measure_files(options: argparse.Namespace) -> int:
     return 1 if errors else 0
 
 
-def _row(
-    path: Path, options: argparse.Namespace, settings: MeasureSettings
-) -> tuple[dict[str, Any], StudioError | None, list[dict[str, Any]]]:
-    """The row of a file, why there is none, and the rows of its profile."""
+def _rows(
+    path: Path, options: argparse.Namespace, settings: MeasureSettings, changes: dict[str, Any]
+) -> tuple[list[dict[str, Any]], StudioError | None, list[dict[str, Any]]]:
+    """The rows of a file, why there are none, and the rows of its profiles."""
+    from dbh_studio.io.project import is_project
+
     try:
-        row, along = _measure_file(path, options, settings)
-        return {"file": str(path)} | row, None, [{"file": str(path)} | point for point in along]
+        if is_project(path):
+            rows, along = _measure_plot(path, options, changes)
+        else:
+            row, along = _measure_file(path, options, settings)
+            rows = [row]
+        return [{"file": str(path)} | row for row in rows], None, [{"file": str(path)} | point for point in along]
     except UnscaledCloudError:
         error: StudioError = unscaled_error()
     except StudioError as other:
         error = other
-    return {"file": str(path), "reason": error.problem, "remedy": error.remedy}, error, []
+    return [{"file": str(path), "reason": error.problem, "remedy": error.remedy}], error, []
 
 
 def _write(rows: list[dict[str, Any]], options: argparse.Namespace) -> None:
@@ -161,17 +175,59 @@ def _measure_file(
     path: Path, options: argparse.Namespace, settings: MeasureSettings
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The row of one file, and the rows of its profile where that is wanted."""
-    from dbh_studio.core.dbh import CurveFit, DbhEstimate, measure_stem
+    from dbh_studio.core.protocol_measure import measure_by_protocol
+    from dbh_studio.core.protocols import Protocol
+    from dbh_studio.core.stem_profile import stem_profile
     from dbh_studio.settings import CurveName
 
     points, scale_sd = _points_of(path, options)
     base = float(points[:, 2].min()) if options.ground_z is None else options.ground_z
     points[:, 2] -= base
-    result = measure_stem(points, settings=settings, curves=get_args(CurveName), scale_sd=scale_sd)
-    row: dict[str, Any]
+    result = measure_by_protocol(points, settings=settings, curves=get_args(CurveName), scale_sd=scale_sd)
+    row = _cells(result, settings, Protocol.of(settings, base="stem" if options.ground_z is None else "placed"))
+    if options.profile is None:
+        return row, []
+    return row, _profile(stem_profile(points, settings=settings, scale_sd=scale_sd), result, row, scale_sd)
+
+
+def _measure_plot(
+    path: Path, options: argparse.Namespace, changes: dict[str, Any]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """The rows of a saved plot's stems, measured as the plot says and as was said of each; and of their profiles."""
+    from dbh_studio.app.commands import change_settings
+    from dbh_studio.app.derived import stem_setup_of
+    from dbh_studio.app.opening import open_plot
+    from dbh_studio.app.session import Session
+    from dbh_studio.core.protocols import measured_by
+
+    if options.ground_z is not None:
+        raise SettingError("--ground-z was given for a saved plot, which has its own ground.", "Leave it away.")
+    session = open_plot(path, scale=options.scale, up=options.up, read_only=True)
+    session.require_scale()
+    if changes:  # of this table, not of the plot
+        session = Session(session.cloud, change_settings("measure", **changes).apply(session.document))
+    document, rows, profiles = session.document, [], []
+    for i in document.trunks.ids:
+        stem = session.compared(i)
+        cells = _cells(stem.result, stem_setup_of(document, i).settings, stem.protocol)
+        rows.append({"stem_id": i, **cells, "corrections": ";".join(measured_by(document.record(i).corrections))})
+        if options.profile is not None:
+            along = _profile(session.profile(i), stem.result, rows[-1], document.scale.relative_sd)
+            profiles += [{"stem_id": i} | point for point in along]
+    return rows, profiles
+
+
+def _cells(result: DbhEstimate | Refusal, settings: MeasureSettings, protocol: Protocol | None) -> dict[str, Any]:
+    """What a row says of a stem's measurement."""
+    from dbh_studio.core.dbh import CurveFit, DbhEstimate
+
+    row: dict[str, Any] = {}
+    if protocol is not None:
+        row = {"breast_height_m": round(protocol.breast_height_m, 4), "base": protocol.base}
+        row |= {"along": protocol.along, "above": protocol.above}
     if isinstance(result, DbhEstimate):
         section = result.section
-        row = {
+        row |= {
             "dbh_cm": round(result.dbh_cm, 2),
             **_intervals(result),
             "dbh_method": result.curve,
@@ -179,7 +235,7 @@ def _measure_file(
             "hom_m": round(section.hom_m, 3),
             "coverage_deg": round(section.coverage_deg, 1),
             "max_gap_deg": round(section.max_gap_deg, 1),
-            "rmse_mm": round(result.rmse_mm, 1),
+            "rmse_mm": round(result.rmse_mm, 1) if math.isfinite(result.rmse_mm) else None,
             "n_points": result.n_points,
             "lean_deg": round(section.lean_deg, 1) if section.axis_source == "stem" else None,
             "taper_cm_per_m": None if result.taper_cm_per_m is None else round(result.taper_cm_per_m, 2),
@@ -188,23 +244,22 @@ def _measure_file(
             "flags": ";".join(result.flag_codes),
         }
     else:
-        row = {"quality": "refused", "reason": result.reason, "remedy": result.remedy, "flags": result.code}
+        row |= {"quality": "refused", "reason": result.reason, "remedy": result.remedy, "flags": result.code}
     for name, fit in result.fits.items():
-        if isinstance(fit, CurveFit):
+        if isinstance(fit, CurveFit) and f"{name}_cm" in COLUMNS:
             row[f"{name}_cm"] = round(100 * fit.diameter_m(settings.definition), 2)
-    return row, _profile(points, result, row, settings, scale_sd) if options.profile is not None else []
+    return row
 
 
 def _profile(
-    points: Float64, result: DbhEstimate | Refusal, row: dict[str, Any], settings: MeasureSettings, scale_sd: float
+    profile: Sequence[ProfilePoint], result: DbhEstimate | Refusal, row: dict[str, Any], scale_sd: float
 ) -> list[dict[str, Any]]:
     """The rows of a stem's profile; what it says against the diameter is added to `row`, in words and as a flag."""
     from dbh_studio.core.dbh import DbhEstimate
-    from dbh_studio.core.stem_profile import breast_height_flag, stem_profile
+    from dbh_studio.core.stem_profile import breast_height_flag
 
-    profile = stem_profile(points, settings=settings, scale_sd=scale_sd)
-    if isinstance(result, DbhEstimate):
-        flag = breast_height_flag(profile, result.hom_m, result.diameters[result.definition])
+    if isinstance(result, DbhEstimate) and "profile" not in result.flag_codes:
+        flag = breast_height_flag(profile, result.hom_m, result.diameters[result.definition], scale_sd=scale_sd)
         if flag is not None:
             row["reason"] = "; ".join(filter(None, (row["reason"], flag.words)))
             row["flags"] = ";".join(filter(None, (row["flags"], flag.code)))

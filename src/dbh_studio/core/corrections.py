@@ -11,16 +11,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from dbh_studio.settings import CurveName
+from dbh_studio.settings import CurveName, HeightAlong, MeasureAbove, SlopeBase
 
 CorrectionKind = Literal[
     "breast_height", "base", "along", "above", "ground", "curve", "left_out", "ring", "tape", "tape_height"
 ]
 CORRECTION_KINDS: tuple[CorrectionKind, ...] = get_args(CorrectionKind)
-
-SlopeBase = Literal["uphill", "midpoint", "downhill"]
-HeightAlong = Literal["vertical", "stem"]
-MeasureAbove = Literal["nothing", "bulge", "buttress"]
 
 # A tape is read in centimetres; beyond this somebody typed millimetres.
 _THICKEST_CM = 2000.0

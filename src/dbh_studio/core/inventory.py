@@ -6,12 +6,13 @@ What is not known is None, never 0. Column names carry their units. `io.inventor
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dbh_studio.core.arrays import Float64
+from dbh_studio.core.protocols import Protocol, measured_by
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.tree_record import TREE_STATUSES, Review, TreeRecord, TreeStatus, check_text
 
@@ -58,7 +59,11 @@ class InventoryRow:
             is one of the three.
         taper_cm_per_m: Loss of diameter per metre of stem.
         flags: Short names of what to look at, see `core.measured.Flag`; `reason` says it in words.
-        hom_m: Height of measurement above ground.
+        tree_dbh_cm: Of the whole tree: √Σd² of its stems, the same in each of their rows; None where one of them has no
+            diameter. Of a tree of one stem its `dbh_cm`.
+        hom_m: Height of measurement above the base, vertically.
+        breast_height_m: The height that was looked for; with `base`, `along` and `above` the rules by which it was, see
+            `core.protocols.Protocol`.
         n_points: Points of the section that support the curve; all of the section where there is no diameter.
         lean_deg: None where the axis was assumed vertical for want of stem.
         quality: ``good``, ``fair``, ``poor``, or ``refused`` where `dbh_cm` is None.
@@ -92,7 +97,12 @@ class InventoryRow:
     dbh_area_cm: float | None
     dbh_area_lo_cm: float | None
     dbh_area_hi_cm: float | None
+    tree_dbh_cm: float | None
     hom_m: float | None
+    breast_height_m: float | None
+    base: str
+    along: str
+    above: str
     coverage_deg: float | None
     max_gap_deg: float | None
     rmse_mm: float | None
@@ -141,7 +151,7 @@ class Inventory:
     def of(
         cls, rows: Iterable[InventoryRow], own: Mapping[int, tuple[tuple[str, str], ...]] | None = None
     ) -> Inventory:
-        """Put rows in order of stem id, with the fields the person has added.
+        """Put rows in order of stem id, with the fields the person has added, and with the diameters of whole trees.
 
         Raises:
             ValueError: Two rows have the same stem id.
@@ -149,7 +159,9 @@ class Inventory:
         ordered = tuple(sorted(rows, key=lambda row: row.stem_id))
         if len({row.stem_id for row in ordered}) != len(ordered):
             raise ValueError("two rows have the same stem id")
-        return cls(ordered, tuple(sorted((i, pairs) for i, pairs in (own or {}).items() if pairs)))
+        return cls(
+            _with_tree_diameters(ordered), tuple(sorted((i, pairs) for i, pairs in (own or {}).items() if pairs))
+        )
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -171,6 +183,26 @@ class Inventory:
     def n_refused(self) -> int:
         """How many stems have none."""
         return len(self.rows) - self.n_measured
+
+
+def _with_tree_diameters(rows: tuple[InventoryRow, ...]) -> tuple[InventoryRow, ...]:
+    """The rows with √Σd² of each tree's stems, and words where a stem without a diameter leaves the tree without."""
+    stems: dict[int, list[InventoryRow]] = {}
+    for row in rows:
+        stems.setdefault(row.tree_id, []).append(row)
+    told: dict[int, InventoryRow] = {}
+    for tree_id, group in stems.items():
+        known = [row.dbh_cm for row in group if row.dbh_cm is not None]
+        if len(known) in (0, len(group)):
+            tree_cm = known[0] if len(known) == 1 else float(np.sqrt(np.sum(np.square(known)))) if known else None
+            told.update((row.stem_id, replace(row, tree_dbh_cm=tree_cm)) for row in group if row.tree_dbh_cm != tree_cm)
+            continue
+        missing = ", ".join(str(row.stem_id) for row in group if row.dbh_cm is None)
+        words = f"tree {tree_id} has no diameter as a whole, because stem {missing} has none"
+        for row in group:
+            reason = row.reason if row.dbh_cm is None else "; ".join(filter(None, (row.reason, words)))
+            told[row.stem_id] = replace(row, tree_dbh_cm=None, reason=reason)
+    return tuple(told.get(row.stem_id, row) for row in rows)
 
 
 def _known(value: float | None) -> float | None:
@@ -196,6 +228,7 @@ def inventory_row(
     scale: ScaleEstimate,
     edited: bool = False,
     position: MapPosition | None = None,
+    protocol: Protocol | None = None,
 ) -> InventoryRow:
     """The row of one stem.
 
@@ -205,6 +238,7 @@ def inventory_row(
         xy_m: (2,) position in the world frame; NaN where unknown.
         edited: Whether a person made or changed the stem's points (besides `record.edited`).
         position: In the source's coordinate reference system, where it has one.
+        protocol: By which rules it was measured; None where it was not.
     """
     section, fit = result.section, _chosen_fit(result)
     # An assumed axis tells nothing about the lean.
@@ -219,6 +253,10 @@ def inventory_row(
         species=record.species,
         **_result_cells(result, record.flag),
         hom_m=_known(section.hom_m) if section else None,
+        breast_height_m=_known(protocol.breast_height_m) if protocol else None,
+        base=protocol.base if protocol else "",
+        along=protocol.along if protocol else "",
+        above=protocol.above if protocol else "",
         coverage_deg=_known(section.coverage_deg) if section else None,
         max_gap_deg=_known(section.max_gap_deg) if section else None,
         rmse_mm=_known(1000.0 * fit.rmse_m) if fit else None,
@@ -235,7 +273,7 @@ def inventory_row(
         crown_class=record.crown_class,
         field_tape_cm=_known(record.correction("tape")),
         field_tape_height_m=_known(record.correction("tape_height")),
-        corrections=";".join(each.kind for each in record.corrections if not each.kind.startswith("tape")),
+        corrections=";".join(measured_by(record.corrections)),
         review=review_state(record.review, result),
         easting=_known(position.easting) if position else None,
         northing=_known(position.northing) if position else None,
@@ -269,6 +307,7 @@ def _result_cells(result: DbhEstimate | Refusal, flag: str = "") -> dict[str, An
             cells[f"dbh_{name}_hi_cm"] = _known(diameter.high_cm)
         return {
             **cells,
+            "tree_dbh_cm": cells["dbh_cm"],
             "dbh_method": result.curve,
             "dbh_definition": result.definition,
             "taper_cm_per_m": _known(result.taper_cm_per_m),
@@ -279,6 +318,7 @@ def _result_cells(result: DbhEstimate | Refusal, flag: str = "") -> dict[str, An
         }
     return {
         **dict.fromkeys(_DIAMETER_COLUMNS),
+        "tree_dbh_cm": None,
         "dbh_method": "",
         "dbh_definition": "",
         "taper_cm_per_m": None,

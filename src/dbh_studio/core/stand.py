@@ -8,16 +8,19 @@ and mean diameter are those of the stems measured.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from dbh_studio.core.arrays import Bool, Float64, readonly
 from dbh_studio.core.inventory import InventoryRow
+from dbh_studio.core.polygons import crosses_itself, signed_area
 
 Units = Literal["metric", "imperial"]
+Per = Literal["stem", "tree"]
 
 HECTARE_M2 = 10_000.0
 ACRE_M2 = 4_046.8564224  # international
@@ -25,6 +28,10 @@ CM_PER_INCH = 2.54
 FT2_PER_M2 = 1.0 / 0.3048**2
 # Widths of diameter classes that are in use: 5 cm, 2 inches.
 CLASS_CM, CLASS_INCHES = 5.0, 2.0
+# Each is a line or a column of what is handed in.
+MOST_CLASSES = 1_000
+# Each side is compared with all others: a coast line of a million corners would take hours.
+MOST_CORNERS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +69,16 @@ class PlotArea:
         """A plot between straight sides; the last corner is joined to the first.
 
         Raises:
-            ValueError: Fewer than three corners, sides that cross, or no area.
+            ValueError: Fewer than three corners or more than `MOST_CORNERS`, sides that cross, or no area.
         """
         corners = np.asarray(corners_m, np.float64)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
             raise ValueError("a plot needs three corners or more, each with x and y")
-        if _crosses_itself(corners):
+        if len(corners) > MOST_CORNERS:
+            raise ValueError(f"it has {len(corners):,} corners: simplify the outline to {MOST_CORNERS:,} or fewer")
+        if crosses_itself(corners):
             raise ValueError("the sides of the plot cross: give the corners in order around it")
-        if not abs(_shoelace(corners)) > 1e-6:
+        if not abs(signed_area(corners)) > 1e-6:
             raise ValueError("the plot has no area")
         return cls(readonly(corners), kind=kind)
 
@@ -93,7 +102,7 @@ class PlotArea:
         if self.outline_m is None:
             assert self.radius_m is not None
             return float(np.pi * self.radius_m**2)
-        return abs(_shoelace(self.outline_m))
+        return abs(signed_area(self.outline_m))
 
     def contains(self, xy_m: Any) -> Bool:
         """(N,) which of (N, 2) places are in it; those exactly on a circle are. NaN is nowhere."""
@@ -118,10 +127,10 @@ class StandRow:
         species: As the person writes it; empty where nobody said.
         n_trees: Trees; the stems of a multi-stem tree make one.
         n_stems: Stems, those without a diameter included.
-        n_refused: Stems without a diameter.
-        stems_per_area: Per hectare or acre.
+        n_refused: Stems without a diameter; of a table per tree, trees without one.
+        stems_per_area: Per hectare or acre; trees where the table is per tree, as in `classes`.
         basal_area: m² per hectare or ft² per acre, of the stems measured; None where all of them are refused.
-        qmd: Quadratic mean diameter, cm or inches; None where no stem is measured.
+        qmd: Quadratic mean diameter of stems, or of trees by √Σd², cm or inches; None where none is measured.
         mean: Arithmetic mean diameter, likewise.
         least: Smallest diameter, likewise.
         greatest: Largest diameter, likewise.
@@ -151,7 +160,10 @@ class StandTable:
         area_m2: Horizontal area of the plot.
         units: ``metric``: cm, m², hectares; ``imperial``: inches, ft², acres.
         class_edges: Lower edges of the diameter classes, and the upper edge of the last.
-        n_outside: Stems that stand outside the plot, or nowhere.
+        n_outside: Stems that stand outside the plot, or nowhere; trees where the table is per tree.
+        per: What is counted and what the diameters are of.
+        least_dbh_cm: Thinner ones are left out.
+        n_thin: How many those are of the ones inside the plot.
     """
 
     rows: tuple[StandRow, ...]
@@ -160,6 +172,9 @@ class StandTable:
     units: Units
     class_edges: tuple[float, ...]
     n_outside: int
+    per: Per = "stem"
+    least_dbh_cm: float = 0.0
+    n_thin: int = 0
 
 
 def stand_table(
@@ -169,6 +184,7 @@ def stand_table(
     units: Units = "metric",
     class_width: float | None = None,
     least_dbh_cm: float = 0.0,
+    per: Per = "stem",
 ) -> StandTable:
     """Count and sum the stems of an inventory.
 
@@ -178,15 +194,20 @@ def stand_table(
         units: Of the table.
         class_width: Of diameter classes, cm or inches; 5 cm or 2 inches by default. Classes begin at multiples of it.
         least_dbh_cm: Thinner stems are left out, as the rules of most inventories have it.
+        per: ``tree`` counts the stems of a multi-stem tree once, with the diameter √Σd² (`InventoryRow.tree_dbh_cm`),
+            at the mean of their places; a tree of which one stem has no diameter has none.
 
     Raises:
-        ValueError: The class width is not positive.
+        ValueError: The class width is not positive, or so small that there are more than `MOST_CLASSES`.
     """
     is_metric = units == "metric"
     width = (CLASS_CM if is_metric else CLASS_INCHES) if class_width is None else class_width
     if not (np.isfinite(width) and width > 0):
         raise ValueError(f"diameter classes are {width:g} wide but must be wider than 0")
     every = list(rows)
+    n_stems_of = Counter(row.tree_id for row in every)
+    if per == "tree":
+        every = _one_per_tree(every)
     places = np.array([[_or_nan(row.x_m), _or_nan(row.y_m)] for row in every], np.float64).reshape(-1, 2)
     is_inside = area.contains(places)
     chosen = [
@@ -209,7 +230,7 @@ def stand_table(
         return StandRow(
             species=species,
             n_trees=len({row.tree_id for row in part}),
-            n_stems=len(part),
+            n_stems=len(part) if per == "stem" else sum(n_stems_of[row.tree_id] for row in part),
             n_refused=len(part) - len(dbh_cm),
             stems_per_area=len(part) * per_area,
             basal_area=basal_area if has or not part else None,
@@ -230,7 +251,25 @@ def stand_table(
         units,
         tuple(edges.tolist()),
         int(np.count_nonzero(~is_inside)),
+        per,
+        least_dbh_cm,
+        int(np.count_nonzero(is_inside)) - len(chosen),
     )
+
+
+def _one_per_tree(rows: Sequence[InventoryRow]) -> list[InventoryRow]:
+    """A row per tree: that of its first stem, with the tree's diameter and the mean of its stems' places."""
+    stems: dict[int, list[InventoryRow]] = {}
+    for row in rows:
+        stems.setdefault(row.tree_id, []).append(row)
+    trees = []
+    for group in stems.values():
+        places = [(row.x_m, row.y_m) for row in group if row.x_m is not None and row.y_m is not None]
+        x_m, y_m = np.mean(places, axis=0).tolist() if places else (None, None)
+        # The first stem's species may be all that is written down; a tree has one.
+        species = next((row.species for row in group if row.species), "")
+        trees.append(replace(group[0], dbh_cm=group[0].tree_dbh_cm, x_m=x_m, y_m=y_m, species=species))
+    return trees
 
 
 def _class_edges(diameters: Float64, width: float) -> Float64:
@@ -239,31 +278,10 @@ def _class_edges(diameters: Float64, width: float) -> Float64:
         return np.empty(0)
     # A diameter on an edge belongs to the class above, so the last class reaches beyond it.
     first, last = int(diameters.min() // width), int(diameters.max() // width) + 1
+    if last - first > MOST_CLASSES:
+        raise ValueError(f"classes {width:g} wide make {last - first:,} of them; {MOST_CLASSES:,} are the most")
     return np.asarray(width * np.arange(first, last + 1), np.float64)
 
 
 def _or_nan(value: float | None) -> float:
     return float("nan") if value is None else value
-
-
-def _shoelace(corners: Float64) -> float:
-    # About the first corner: far from the origin the products would lose the area.
-    x, y = (corners - corners[0]).T
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
-
-
-def _crosses_itself(corners: Float64) -> bool:
-    """Whether two sides that are not neighbours meet."""
-    n = len(corners)
-    a, b = corners, np.roll(corners, -1, axis=0)
-
-    def side(p: Float64, q: Float64, r: Float64) -> float:
-        return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
-
-    for i in range(n):
-        for j in range(i + 2, n):
-            if (j + 1) % n == i:
-                continue
-            if side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) < 0 > side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]):
-                return True
-    return False

@@ -18,6 +18,7 @@ from dbh_studio.core.arrays import as_points
 from dbh_studio.core.estimator import assess_stem, stem_line
 from dbh_studio.core.interval_methods import estimator_settings
 from dbh_studio.core.measured import Diameter, Flag
+from dbh_studio.core.swelling import flag_of, own_sd
 from dbh_studio.settings import MeasureSettings
 
 STEP_M = 0.10
@@ -103,26 +104,26 @@ def _heights(heights_m: NDArray[np.floating[Any]], highest_m: float) -> list[flo
     return [round(STEP_M * step, 2) for step in range(first, last + 1)]
 
 
-def breast_height_flag(profile: Sequence[ProfilePoint], height_m: float, diameter: Diameter) -> Flag | None:
+def breast_height_flag(
+    profile: Sequence[ProfilePoint], height_m: float, diameter: Diameter, *, scale_sd: float = 0.0
+) -> Flag | None:
     """What to say where the diameter at breast height contradicts the stem above and below it; None where it does not.
 
     Args:
         profile: From `stem_profile`.
         height_m: Of the measurement.
         diameter: There, with its interval.
+        scale_sd: Relative standard error of the scale in that interval: all diameters of a stem share it, so it
+            excuses no difference between them.
     """
     expected = _expected(profile, height_m)
     if expected is None:
         return None
     value_cm, spread = expected
     off = float(np.log(diameter.value_cm / value_cm))
-    own = diameter.half_width / 1.645 if np.isfinite(diameter.half_width) else 0.0
-    if abs(off) < max(_AT_LEAST, _TOO_FAR * float(np.hypot(own, spread))):
+    if abs(off) < max(_AT_LEAST, _TOO_FAR * float(np.hypot(own_sd(diameter, scale_sd), spread))):
         return None
-    word = "thicker" if off > 0 else "thinner"
-    share = 100 * abs(np.expm1(off))
-    words = f"{share:.0f} % {word} than the stem above and below says ({value_cm:.1f} cm): look at the section"
-    return Flag("profile", words)
+    return flag_of(off, value_cm)
 
 
 def _expected(profile: Sequence[ProfilePoint], height_m: float) -> tuple[float, float] | None:
