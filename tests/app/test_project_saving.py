@@ -17,12 +17,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from tests.app.plots import contents, make_session, make_trunks
 
 from dbh_studio.app import commands
-from dbh_studio.app.autosave import Autosave, document_from_state
+from dbh_studio.app.autosave import Autosave
 from dbh_studio.app.opening import save_as
+from dbh_studio.app.saved_states import document_from_state, history_from_states
 from dbh_studio.app.session import Session
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.errors import CommandError, ProjectError
-from dbh_studio.io.project import ProjectWriter, read_project
+from dbh_studio.io.project import ProjectWriter, read_plot, read_project
 
 
 def keep(session: Session, folder: Path, **options) -> Autosave:
@@ -35,6 +36,14 @@ def on_disk(session: Session, folder: Path):
 
 def history(folder: Path) -> list[str]:
     return [json.loads(line)["what"] for line in (folder / "history.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def fill_disk(patch: pytest.MonkeyPatch) -> None:
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    patch.setattr(os, "fsync", full)
+    patch.setattr(os, "write", full)
 
 
 def test_every_command_is_saved_before_it_returns(tmp_path):
@@ -78,11 +87,8 @@ def test_a_full_disk_is_reported_keeps_the_session_alive_and_is_tried_again(tmp_
     heard = []
     saver.subscribe(lambda status: heard.append(status.state))
 
-    def full(descriptor):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
+        fill_disk(patch)
         session.do(commands.delete_trunk(1))
         session.do(commands.delete_trunk(2))
         assert not saver.flush()
@@ -114,10 +120,12 @@ def test_in_the_background_commands_do_not_wait_and_are_all_there_after_a_flush(
     monkeypatch.setattr(ProjectWriter, "save", slow)
     for i in range(1, 11):
         session.do(commands.delete_trunk(i))
-    assert len(read_project(folder).trunks) == 20
-    may_save.set()
+    # The plot itself is not saved yet; what was done is there.
+    assert read_plot(folder).saved_trunks.ids == tuple(range(1, 21))
+    assert on_disk(session, folder) == contents(session.document)
     assert saver.flush()
-    assert n_saves <= 3
+    assert n_saves == 0
+    may_save.set()
     assert on_disk(session, folder) == contents(session.document)
     assert history(folder)[1:] == [f"Delete trunk {i}" for i in range(1, 11)]
     session.do(commands.delete_trunk(11))
@@ -126,21 +134,52 @@ def test_in_the_background_commands_do_not_wait_and_are_all_there_after_a_flush(
     assert history(folder)[-1] == "Delete trunk 11"
 
 
-def test_a_failed_background_save_is_tried_again_with_the_next_command(tmp_path, monkeypatch):
+def test_a_save_that_failed_is_tried_again_by_itself_and_nothing_is_missing_then(tmp_path, monkeypatch):
     folder = tmp_path / "plot.dbh"
     session, _ = make_session()
-    saver = keep(session, folder, background=True)
+    saver = keep(session, folder, background=True, retry_s=0.01)
+    first = contents(session.document)
     reached = {"not_saved": threading.Event(), "saved": threading.Event(), "saving": threading.Event()}
     saver.subscribe(lambda status: reached[status.state].set())
     with monkeypatch.context() as patch:
-        patch.setattr(ProjectWriter, "save", _fail)
+        fill_disk(patch)
         session.do(commands.delete_trunk(1))
+        session.do(commands.set_tree_record(2, species="oak"))
         assert reached["not_saved"].wait(120)
-    assert saver.status.problem == "The plot could not be saved (something unforeseen)."
-    session.do(commands.delete_trunk(2))
+        assert "No space left" in saver.status.problem and "every few seconds" in saver.status.problem
+        assert on_disk(session, folder) == first
+        reached["saved"].clear()
     assert reached["saved"].wait(120)
-    assert read_project(folder).trunks.ids == (3, 4, 5)
+    assert on_disk(session, folder) == contents(session.document)
+    assert history(folder) == ["Create the plot", "Delete trunk 1", "Describe trunk 2"]
     session.close()
+    assert len(read_plot(folder).states.past) == 2
+
+
+def test_what_a_full_disk_left_of_a_step_is_written_over(tmp_path, monkeypatch):
+    folder = tmp_path / "plot.dbh"
+    session, _ = make_session()
+    keep(session, folder)
+    write = os.write
+    with monkeypatch.context() as patch:
+        n_calls = 0
+
+        def half(descriptor, content):
+            nonlocal n_calls
+            n_calls += 1
+            if n_calls % 2:
+                return write(descriptor, bytes(content)[: len(content) // 2])
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        patch.setattr(os, "write", half)
+        patch.setattr(os, "fsync", lambda _: half(0, b""))
+        session.do(commands.delete_trunk(1))
+        session.do(commands.delete_trunk(2))
+    session.do(commands.delete_trunk(3))
+    session.close()
+    plot = read_plot(folder)
+    assert plot.notes == () and plot.log.end.offset == (folder / "undo.log").stat().st_size
+    assert [label for label, _ in plot.states.past] == [f"Delete trunk {i}" for i in (1, 2, 3)]
 
 
 def _fail(self, state, **options):
@@ -152,7 +191,7 @@ def test_closing_saves_what_a_full_disk_kept_back(tmp_path, monkeypatch):
     session, _ = make_session()
     keep(session, folder)
     with monkeypatch.context() as patch:
-        patch.setattr(ProjectWriter, "save", _fail)
+        fill_disk(patch)
         session.do(commands.delete_trunk(1))
     session.close()
     session.close()
@@ -229,6 +268,7 @@ def test_a_last_save_that_fails_is_told(tmp_path, monkeypatch, caplog):
     session, _ = make_session()
     saver = keep(session, tmp_path / "plot.dbh")
     monkeypatch.setattr(ProjectWriter, "save", _fail)
+    fill_disk(monkeypatch)
     session.do(commands.delete_trunk(1))
     with pytest.raises(ProjectError, match="something unforeseen"):
         session.flush()
@@ -311,10 +351,10 @@ class SavedModel(RuleBasedStateMachine):
         before, next_id = contents(self.session.document), self.session.next_id
         self.session.close()
         writer = ProjectWriter(self.folder)
-        state = read_project(self.folder)
-        writer.adopt(state)
-        self.session = Session(self.session.cloud, document_from_state(state, self.session.document.source))
-        Autosave(self.session, writer, background=False, author="", is_new=False)
+        plot = read_plot(self.folder)
+        again = history_from_states(plot.states, self.session.document.source)
+        self.session = Session(self.session.cloud, again.present, history=again)
+        Autosave(self.session, writer, background=False, author="", opened=plot)
         assert contents(self.session.document) == before
         assert self.session.next_id == next_id
 

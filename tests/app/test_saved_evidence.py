@@ -8,9 +8,10 @@ import pytest
 from tests.app.plots import contents, make_session
 
 from dbh_studio.app import commands
-from dbh_studio.app.autosave import Autosave, document_from_state
+from dbh_studio.app.autosave import Autosave
 from dbh_studio.app.document import CameraSource
 from dbh_studio.app.marker_cache import keep_detections, kept_detections
+from dbh_studio.app.saved_states import document_from_state
 from dbh_studio.core.camera import CameraModel
 from dbh_studio.core.posed_images import PosedImage, PosedImages
 from dbh_studio.core.scale import ScaleEstimate

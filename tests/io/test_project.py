@@ -22,8 +22,8 @@ from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import ProjectError, ProjectLockedError, ProjectVersionError
-from dbh_studio.io import project
-from dbh_studio.io.project import HistoryEntry, PlotState, ProjectWriter, is_project, read_project
+from dbh_studio.io import project, project_read
+from dbh_studio.io.project import HistoryEntry, PlotState, ProjectWriter, is_project, read_plot, read_project
 from dbh_studio.settings import Settings
 
 REPOSITORY = Path(__file__).parents[2]
@@ -110,8 +110,8 @@ def test_trunks_are_written_only_when_they_changed_and_the_old_file_goes(tmp_pat
     writer.close()
     assert same(read_project(folder), fewer)
     again = ProjectWriter(folder)
-    again.adopt(read := read_project(folder))
-    again.save(read)
+    again.adopt(read := read_plot(folder))
+    again.save(read.states.present)
     assert [path.name for path in folder.glob("trunks*")] == ["trunks-2.npz"]
     again.save(state, next_id=77)
     again.close()
@@ -459,7 +459,7 @@ def test_a_reader_beside_a_writer_sees_one_whole_state(tmp_path, monkeypatch):
     states = [make_state(tmp_path, n_trunks=n) for n in (1, 2, 3)]
     writer.save(states[0])
     later = iter(states[1:])
-    parse = project._parse
+    parse = project_read._parse
 
     def then_written(path):
         saved = parse(path)
@@ -467,7 +467,7 @@ def test_a_reader_beside_a_writer_sees_one_whole_state(tmp_path, monkeypatch):
             writer.save(state)
         return saved
 
-    monkeypatch.setattr(project, "_parse", then_written)
+    monkeypatch.setattr(project_read, "_parse", then_written)
     assert same(read_project(folder), states[2])
     writer.close()
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dbh_studio.app.autosave import Autosave, document_from_state
+from dbh_studio.app.autosave import Autosave
 from dbh_studio.app.candidates import keep_offers, kept_offers
 from dbh_studio.app.commands import set_scale, set_up
 from dbh_studio.app.document import Direction, Document, SourceInfo, unit_direction
 from dbh_studio.app.last_search import keep_search, kept_search
 from dbh_studio.app.plot_masks import MASKS_FOLDER, carry_masks, masks_folder
-from dbh_studio.app.session import Session, check_scale
+from dbh_studio.app.saved_states import history_from_states
+from dbh_studio.app.session import History, Session
+from dbh_studio.app.session_checks import check_scale
 from dbh_studio.app.vote_cache import carry_votes, votes_folder
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
 from dbh_studio.core.scale import ScaleEstimate, ScaleSource
@@ -27,7 +29,15 @@ from dbh_studio.errors import (
     ProjectMismatchError,
     SettingError,
 )
-from dbh_studio.io.project import PROJECT_FILE, PlotState, ProjectWriter, is_project, read_project
+from dbh_studio.io.project import (
+    PROJECT_FILE,
+    PlotState,
+    ProjectWriter,
+    UndoStates,
+    is_project,
+    read_plot,
+    read_project,
+)
 
 if TYPE_CHECKING:
     from dbh_studio.core.datacheck import DataCheck
@@ -256,7 +266,22 @@ def scale_from_check(check: DataCheck) -> ScaleEstimate:
     return ScaleEstimate(check.metres_per_unit, sources.get(check.unit, "factor"))
 
 
-def _session(reconstruction: Reconstruction, document: Document, check: DataCheck, read_only: bool) -> Session:
+def _history(states: UndoStates, info: SourceInfo) -> tuple[History, tuple[str, ...]]:
+    """The plot with what Undo and Redo lead to; without that, and with words for it, where that contradicts itself."""
+    try:
+        return history_from_states(states, info), ()
+    except ValueError as error:
+        alone = history_from_states(replace(states, past=(), future=()), info)
+        return alone, (f"What was done before cannot be undone any more, because it contradicts itself ({error}).",)
+
+
+def _session(
+    reconstruction: Reconstruction,
+    document: Document,
+    check: DataCheck,
+    read_only: bool,
+    history: History | None = None,
+) -> Session:
     return Session(
         reconstruction.cloud,
         document,
@@ -264,6 +289,7 @@ def _session(reconstruction: Reconstruction, document: Document, check: DataChec
         mesh=reconstruction.mesh,
         notes=reconstruction.notes,
         read_only=read_only,
+        history=history,
         is_geographic=reconstruction.provenance.is_geographic,
     )
 
@@ -287,7 +313,8 @@ def _reopen(
         read_project(folder)  # raises, with the words for it
     writer = None if read_only else ProjectWriter(folder)
     try:
-        state = read_project(folder)
+        saved = read_plot(folder)
+        state = saved.states.present
         path = Path(source) if source is not None else state.source_path
         if not path.exists():
             raise FileMissingError(
@@ -298,17 +325,20 @@ def _reopen(
         reconstruction, info = _read_source_of(
             state, (path, None if source is not None else state.other_source_path), folder, read, progress
         )
-        document = document_from_state(state, info)
+        history, notes = _history(saved.states, info)
+        document = history.present
         check = _check(reconstruction, _Wish(document.scale, document.up_direction))
-        session = _session(reconstruction, document, check, read_only)
+        session = _session(reconstruction, document, check, read_only, history)
+        # Beside a program that writes the plot, it is not closed as a matter of course.
+        session.reopening_notes = (*(saved.lost if read_only else saved.notes), *notes)
         session.last_search = kept_search(folder, document)
         session.read_from = folder.absolute() if read_only else None
         session.offers = kept_offers(folder, document)
         if writer is not None:
-            writer.adopt(state)
             # A new place is told to the saved plot at once: the next program may not be told.
             has_moved = info.path != state.source_path
-            Autosave(session, writer, background=background, is_new=has_moved, label=f"Find the cloud at {info.path}")
+            label = f"Find the cloud at {info.path}"
+            Autosave(session, writer, background=background, opened=saved, is_new=has_moved, label=label)
     except BaseException:
         if writer is not None:
             writer.close()

@@ -5,22 +5,23 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from dbh_studio.app.commands import Command
 from dbh_studio.app.derived import UNSCALED_REASON, UNSCALED_REMEDY, Derived
 from dbh_studio.app.document import Document
+from dbh_studio.app.session_checks import check_fresh, check_scale
 from dbh_studio.core.arrays import Float32
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.inventory import Inventory
 from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.core.scale import ScaleEstimate
-from dbh_studio.errors import CommandError, ProjectError, SettingError, StaleResultError, UnscaledCloudError
+from dbh_studio.errors import CommandError, ProjectError, UnscaledCloudError
 
 if TYPE_CHECKING:
     from dbh_studio.app.autosave import Autosave
@@ -35,36 +36,23 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 HISTORY_LIMIT = 200
-# From micrometres to a reconstruction whose unit is ten kilometres: beyond it somebody slipped on the keyboard.
-_LEAST_SCALE, _MOST_SCALE = 1e-6, 1e4
-
-_FIELDS = {
-    "plot_id": "the name of the plot",
-    "source": "the cloud",
-    "up_direction": "the up direction",
-    "scale": "the scale",
-    "settings": "the settings",
-    "settings.ground": "the ground settings",
-    "settings.trunks": "the trunk settings",
-    "settings.measure": "the measurement settings",
-    "trunks": "the trunks",
-    "trees": "what is said about the trees",
-    "north_direction": "the direction of north",
-    "origin_src": "the plot's origin",
-    "evidence": "the known lengths",
-    "cameras": "the photos",
-    "masks": "the masks the trunks were found by",
-}
-_ALL_FIELDS = tuple(name for name in _FIELDS if "." not in name)
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What happened. A listener compares fields by identity: ``after.trunks is not before.trunks``."""
+    """What happened. A listener compares fields by identity: ``after.trunks is not before.trunks``.
+
+    Attributes:
+        before: The plot as it was.
+        after: The plot as it is.
+        label: What was done, for people.
+        kind: Whether it was a command, or one taken back or done again.
+    """
 
     before: Document
     after: Document
     label: str
+    kind: Literal["do", "undo", "redo"] = "do"
 
     @property
     def moves_points(self) -> bool:
@@ -75,6 +63,23 @@ class Change:
 
 
 Listener = Callable[[Change], None]
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """A plot with what Undo and Redo lead to.
+
+    Attributes:
+        present: The plot as it is.
+        past: What each command was called and the Document before it, the latest last.
+        future: What each undone command was called and the Document after it, the next one last.
+        next_id: The lowest trunk id never given out, undone commands included.
+    """
+
+    present: Document
+    past: tuple[tuple[str, Document], ...] = ()
+    future: tuple[tuple[str, Document], ...] = ()
+    next_id: int = 1
 
 
 class Session:
@@ -92,6 +97,7 @@ class Session:
         read_only: Refuse every command.
         is_geographic: The coordinates are degrees, which no scale turns into metres.
         history_limit: How many commands can be undone.
+        history: What could be undone and redone when the plot was closed; its present is `document`.
         derived: For tests.
 
     Raises:
@@ -109,6 +115,7 @@ class Session:
         read_only: bool = False,
         is_geographic: bool = False,
         history_limit: int = HISTORY_LIMIT,
+        history: History | None = None,
         derived: Derived | None = None,
     ) -> None:
         if document.source.n_points != len(cloud):
@@ -120,6 +127,10 @@ class Session:
         self.is_read_only = read_only
         self._is_geographic = is_geographic
         self.saver: Autosave | None = None
+        # What was lost, or brought back, when the saved plot was opened, in plain words.
+        self.reopening_notes: tuple[str, ...] = ()
+        # Who writes the saved plot, where that is why it is only read.
+        self.held_by = ""
         # The saved plot it was read from, where it is only read.
         self.read_from: Path | None = None
         self._document = document
@@ -129,11 +140,13 @@ class Session:
         self.last_search: LastSearch | None = None
         # Stems that may be trunks; beside the Document, for they are none until somebody says so.
         self.offers: Offers | None = None
-        self._next_id = document.trunks.next_id
-        self._past: deque[tuple[str, Document]] = deque(maxlen=history_limit)
-        self._future: list[tuple[str, Document]] = []
+        history = history or History(document)
+        self._next_id = max(document.trunks.next_id, history.next_id)
+        self._past: deque[tuple[str, Document]] = deque(history.past, maxlen=history_limit)
+        self._future: list[tuple[str, Document]] = list(history.future)
         self._lock = threading.RLock()
         self._listeners: list[Listener] = []
+        self._recorders: list[Listener] = []
         self._untold: deque[Change] = deque()
         self._telling = threading.RLock()
         self._is_telling = False
@@ -172,6 +185,12 @@ class Session:
             return self._past[-1][0] if self._past else ""
 
     @property
+    def earlier(self) -> tuple[tuple[str, Document], ...]:
+        """What can be undone, oldest first: (what was done, the Document before it)."""
+        with self._lock:
+            return tuple(self._past)
+
+    @property
     def redo_label(self) -> str:
         """What Redo would do again; empty where nothing."""
         with self._lock:
@@ -196,7 +215,7 @@ class Session:
             self._check_writable()
             before = self._document
             if based_on is not None:
-                _check_fresh(based_on, before, tuple(reads) or _ALL_FIELDS)
+                check_fresh(based_on, before, reads)
             after = self._apply(command, before)
             if after.scale != before.scale:
                 check_scale(after.scale, before.source.path.name, is_geographic=self._is_geographic)
@@ -221,7 +240,7 @@ class Session:
                 raise CommandError("There is nothing to undo.")
             label, earlier = self._past.pop()
             self._future.append((label, self._document))
-            change = Change(self._document, earlier, f"Undo: {label}")
+            change = Change(self._document, earlier, f"Undo: {label}", "undo")
             self._move_to(change)
         self._tell()
         return change
@@ -238,10 +257,16 @@ class Session:
                 raise CommandError("There is nothing to redo.")
             label, later = self._future.pop()
             self._past.append((label, self._document))
-            change = Change(self._document, later, f"Redo: {label}")
+            change = Change(self._document, later, f"Redo: {label}", "redo")
             self._move_to(change)
         self._tell()
         return change
+
+    def forget_before(self, n_commands: int) -> None:
+        """Let no more than the last `n_commands` be undone from now on."""
+        with self._lock:
+            while len(self._past) > n_commands:
+                self._past.popleft()
 
     def _check_writable(self) -> None:
         if self.is_read_only:
@@ -261,21 +286,39 @@ class Session:
     def _move_to(self, change: Change) -> None:
         self._document = change.after
         self._next_id = max(self._next_id, change.after.trunks.next_id)
+        for recorder in tuple(self._recorders):
+            self._tell_one(recorder, change)
         self._untold.append(change)
 
     # ---- listeners
 
+    @contextmanager
+    def held(self) -> Iterator[History]:
+        """The plot, its past and its future, while nothing can change them; for moments, since everybody waits."""
+        with self._lock:
+            yield History(self._document, tuple(self._past), tuple(self._future), self._next_id)
+
+    def record_with(self, recorder: Listener) -> Callable[[], None]:
+        """Call `recorder` with every change as it happens, before anybody hears of it; returns what ends that.
+
+        It is called in the order of the changes, while no other can happen: it must be quick and send no commands.
+        """
+        return self._registered(self._recorders, recorder)
+
     def subscribe(self, listener: Listener) -> Callable[[], None]:
         """Call `listener` after every change; returns the function that ends it."""
+        return self._registered(self._listeners, listener)
+
+    def _registered(self, listeners: list[Listener], listener: Listener) -> Callable[[], None]:
         with self._lock:
-            self._listeners.append(listener)
+            listeners.append(listener)
 
-        def unsubscribe() -> None:
+        def unregister() -> None:
             with self._lock:
-                if listener in self._listeners:
-                    self._listeners.remove(listener)
+                if listener in listeners:
+                    listeners.remove(listener)
 
-        return unsubscribe
+        return unregister
 
     def _tell(self) -> None:
         with self._telling:
@@ -396,38 +439,3 @@ class Session:
         saver, self.saver = self.saver, None
         if saver is not None:
             saver.close()
-
-
-def check_scale(scale: ScaleEstimate, name: str, *, is_geographic: bool = False) -> None:
-    """Raise SettingError where the cloud called `name` cannot have this scale: before it overflows what follows."""
-    if not scale.is_known:
-        return
-    if is_geographic:
-        raise SettingError(
-            f"The coordinates of {name} are degrees of longitude and latitude, which no scale turns into metres.",
-            "Convert the cloud to a projected system (UTM, or the national grid) first.",
-        )
-    if not _LEAST_SCALE <= scale.metres_per_unit <= _MOST_SCALE:
-        raise SettingError(
-            f"{scale.metres_per_unit:g} metres per unit is beyond reason.",
-            f"Give {_LEAST_SCALE:g} to {_MOST_SCALE:,.0f} metres per unit, or the name of a unit such as metres.",
-        )
-
-
-def _field(document: Document, name: str) -> Any:
-    value: Any = document
-    for part in name.split("."):
-        value = getattr(value, part)
-    return value
-
-
-def _check_fresh(then: Document, now: Document, reads: tuple[str, ...]) -> None:
-    for name in reads:
-        if name not in _FIELDS:
-            raise ValueError(f"{name!r} is not a field of a Document")
-        value_then, value_now = _field(then, name), _field(now, name)
-        if value_then is not value_now and value_then != value_now:
-            raise StaleResultError(
-                f"While the work ran, {_FIELDS[name]} changed, so its result no longer fits and was not used.",
-                "Start it again.",
-            )

@@ -1,7 +1,7 @@
 """What project.json holds, as models that check it, and the way between them and the program's own types.
 
 Schema 1 had no `masks`; a plot of that time is read as one whose trunks did not come from masks. Schema 2
-had no health, crown class, own fields, corrections and reviews of trees.
+had no health, crown class, own fields, corrections and reviews of trees, and no undo log.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from dbh_studio.core.corrections import Correction, CorrectionKind
 from dbh_studio.core.mask_record import MaskKind, MaskRecord, MaskRung
@@ -33,14 +33,23 @@ def _check_text(text: str) -> str:
     return text
 
 
+def _is_unit(direction: tuple[float, float, float]) -> tuple[float, float, float]:
+    if abs(sum(part * part for part in direction) - 1) > 1e-6:
+        raise ValueError("is not of length 1")
+    return direction
+
+
 Text = Annotated[str, AfterValidator(_check_text)]
+UnitDirection = Annotated[tuple[float, float, float], AfterValidator(_is_unit)]
 
 
-class _Model(BaseModel):
+class Model(BaseModel):
+    """What is read from a saved plot: nothing unknown, and no number that is none."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class SavedSource(_Model):
+class SavedSource(Model):
     """Where the cloud is; `relative_path` is from the saved plot, so that both may be moved together."""
 
     path: Text
@@ -50,7 +59,7 @@ class SavedSource(_Model):
     fingerprint: Text
 
 
-class SavedScale(_Model):
+class SavedScale(Model):
     """A `ScaleEstimate`."""
 
     metres_per_unit: float = Field(gt=0)
@@ -58,7 +67,7 @@ class SavedScale(_Model):
     standard_error: float | None = Field(ge=0)
 
 
-class SavedCorrection(_Model):
+class SavedCorrection(Model):
     """A `Correction`; places and indices as lists."""
 
     kind: CorrectionKind
@@ -68,7 +77,7 @@ class SavedCorrection(_Model):
     why: Text = ""
 
 
-class SavedReview(_Model):
+class SavedReview(Model):
     """A `Review`."""
 
     decision: ReviewDecision
@@ -78,7 +87,7 @@ class SavedReview(_Model):
     when: Text = ""
 
 
-class SavedTree(_Model):
+class SavedTree(Model):
     """A `TreeRecord`."""
 
     species: Text = ""
@@ -103,7 +112,7 @@ class SavedTree(_Model):
         return TreeRecord(**(self.model_dump() | nested))
 
 
-class SavedSight(_Model):
+class SavedSight(Model):
     """A `Sight`."""
 
     image: Text
@@ -111,7 +120,7 @@ class SavedSight(_Model):
     v_px: float
 
 
-class SavedPoint(_Model):
+class SavedPoint(Model):
     """A `MarkedPoint`."""
 
     xyz_src: tuple[float, float, float]
@@ -119,7 +128,7 @@ class SavedPoint(_Model):
     sights: tuple[SavedSight, ...] = ()
 
 
-class SavedBar(_Model):
+class SavedBar(Model):
     """A `ScaleBar`."""
 
     name: Text
@@ -129,7 +138,7 @@ class SavedBar(_Model):
     role: Literal["control", "check"]
 
 
-class SavedSquare(_Model):
+class SavedSquare(Model):
     """A `MarkerSquare`."""
 
     name: Text
@@ -143,7 +152,7 @@ class SavedSquare(_Model):
     systematic_src: float = Field(0.0, ge=0)
 
 
-class SavedEvidence(_Model):
+class SavedEvidence(Model):
     """A `ScaleEvidence`."""
 
     bars: tuple[SavedBar, ...] = ()
@@ -175,7 +184,7 @@ def _points(saved: Iterable[SavedPoint]) -> tuple[MarkedPoint, ...]:
     )
 
 
-class SavedCameras(_Model):
+class SavedCameras(Model):
     """Where the photos are; relative paths as of `SavedSource`."""
 
     path: Text
@@ -185,7 +194,7 @@ class SavedCameras(_Model):
     frame: Literal["cloud", "file"] = "cloud"
 
 
-class SavedMasks(_Model):
+class SavedMasks(Model):
     """A `MaskRecord`; relative paths as of `SavedSource`."""
 
     kind: MaskKind
@@ -214,30 +223,31 @@ class SavedMasks(_Model):
         return MaskRecord(**(self.model_dump(exclude={"relative_path"}) | {"path": path}))
 
 
-class SavedProject(_Model):
+class SavedUndo(Model):
+    """Which undo log goes with the plot, and how much had been done when the plot was saved; see `io.undo_log`."""
+
+    log: str = Field(pattern="^[0-9a-f]{32}$")
+    number: int = Field(ge=0)
+
+
+class SavedProject(Model):
     """project.json, schema version 3."""
 
     schema_version: Literal[3] = 3
     plot_id: Text
     source: SavedSource
-    up_direction: tuple[float, float, float]
+    up_direction: UnitDirection
     scale: SavedScale
     settings: Settings
     trunks_file: str = Field(pattern=f"^{TRUNKS_FILE.pattern}$")
     next_id: int = Field(ge=1, le=MAX_TRUNK_ID + 1)
     trees: dict[int, SavedTree]
-    north_direction: tuple[float, float, float] | None = None
+    north_direction: UnitDirection | None = None
     origin_src: tuple[float, float, float] = (0.0, 0.0, 0.0)
     evidence: SavedEvidence = SavedEvidence()
     cameras: SavedCameras | None = None
     masks: SavedMasks | None = None
-
-    @field_validator("up_direction", "north_direction")
-    @classmethod
-    def _is_unit(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-        if up is not None and abs(sum(part * part for part in up) - 1) > 1e-6:
-            raise ValueError("is not of length 1")
-        return up
+    undo: SavedUndo | None = None
 
 
 @dataclass(frozen=True)
@@ -308,7 +318,9 @@ def locate(folder: Path, source: SavedSource) -> tuple[Path, Path | None]:
     return beside, before if before != beside and os.path.exists(before) else None  # noqa: PTH110
 
 
-def saved_project(state: PlotState, folder: Path, trunks_file: str, next_id: int) -> SavedProject:
+def saved_project(
+    state: PlotState, folder: Path, trunks_file: str, next_id: int, undo: SavedUndo | None = None
+) -> SavedProject:
     """What is written to project.json in `folder`, beside `trunks_file`."""
     scale = state.scale
     return SavedProject(
@@ -331,12 +343,14 @@ def saved_project(state: PlotState, folder: Path, trunks_file: str, next_id: int
         north_direction=state.north_direction,
         origin_src=state.origin_src,
         evidence=SavedEvidence.of(state.evidence),
-        cameras=None if state.cameras is None else _saved_cameras(state.cameras, folder),
+        cameras=None if state.cameras is None else saved_cameras(state.cameras, folder),
         masks=None if state.masks is None else SavedMasks.of(state.masks, folder),
+        undo=undo,
     )
 
 
-def _saved_cameras(cameras: CameraPlace, folder: Path) -> SavedCameras:
+def saved_cameras(cameras: CameraPlace, folder: Path) -> SavedCameras:
+    """What is saved of them in a plot at `folder`."""
     images = cameras.images_dir
     return SavedCameras(
         path=str(cameras.path),
