@@ -17,6 +17,7 @@ import numpy as np
 
 from dbh_studio.app.commands import Command, existing_trunk
 from dbh_studio.app.document import Document
+from dbh_studio.app.edit_pool import blocks_of
 from dbh_studio.app.edits import add_trunk, assign_points, keep_only, split_trunk
 from dbh_studio.app.session import Session
 from dbh_studio.core.arrays import Float32, Int64
@@ -25,6 +26,7 @@ from dbh_studio.core.picking import PickCloud, View
 from dbh_studio.core.trunk_edits import beyond_plane, grown, plane_of_line, shrunk
 from dbh_studio.core.trunks import Trunk
 from dbh_studio.errors import CommandError
+from dbh_studio.settings import TrunkSettings
 
 # What a trunk grows or shrinks by at a press of a key, metres.
 STEP_M = 0.03
@@ -124,17 +126,21 @@ def add_by_click(session: Session, seed_world: Any) -> tuple[Command, str]:
 
     document = session.document
     session.require_scale(document)
+    points, settings = session.points_world(document), document.settings.trunks
+    place, reach = np.asarray(seed_world, np.float64).reshape(3), _reach_of_stem_m(settings)
+    about = np.array([reach, reach, np.inf])
+    rows = blocks_of(session, document).in_box(place - about, place + about)
     stem = grow_stem(
-        session.points_world(document),
-        seed_world,
+        points.take(rows, axis=0),
+        place,
         session.ground(document=document),
-        is_free=~_owned(document),
-        settings=document.settings.trunks,
+        is_free=~_owned(document)[rows],
+        settings=settings,
         seed=document.settings.measure.seed,
     )
     if isinstance(stem, Refusal):
         raise CommandError(stem.reason, stem.remedy)
-    return add_trunk(stem.rows), stem.note
+    return add_trunk(rows[stem.rows]), stem.note
 
 
 def grow_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) -> Command:
@@ -142,9 +148,15 @@ def grow_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) -> C
     document = session.document
     trunk = existing_trunk(document, trunk_id)
     points = session.points_world(document)
-    near = _near(points, trunk, distance_m)
+    near = _near(session, document, trunk, distance_m)
     free = near[~_owned(document)[near]]
-    return assign_points(grown(points, trunk.points, free, distance_m), trunk_id)
+    joins = grown(points, trunk.points, free, distance_m)
+    if not len(joins):
+        raise CommandError(
+            f"There are no free points within {100 * distance_m:.0f} cm of trunk {trunk_id}.",
+            "Choose them with the lasso, and give them to it.",
+        )
+    return assign_points(joins, trunk_id)
 
 
 def shrink_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) -> Command:
@@ -156,7 +168,7 @@ def shrink_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) ->
     document = session.document
     trunk = existing_trunk(document, trunk_id)
     points = session.points_world(document)
-    others = np.setdiff1d(_near(points, trunk, distance_m), trunk.points, assume_unique=True)
+    others = np.setdiff1d(_near(session, document, trunk, distance_m), trunk.points, assume_unique=True)
     left = shrunk(points, trunk.points, others, distance_m)
     if len(left) < 3:
         raise CommandError(f"Nothing of trunk {trunk_id} would be left.", "Shrink it by less, or delete it.")
@@ -182,11 +194,12 @@ def _owned(document: Document) -> np.ndarray:
     return owned
 
 
-def _near(points: Float32, trunk: Trunk, distance: float) -> Int64:
+def _near(session: Session, document: Document, trunk: Trunk, distance: float) -> Int64:
     """Rows of the points in the trunk's box, wider by a distance on all sides."""
-    own = points[trunk.points]
-    lower, upper = own.min(axis=0) - distance, own.max(axis=0) + distance
-    rows = np.flatnonzero((points[:, 0] >= lower[0]) & (points[:, 0] <= upper[0]))
-    for axis in (1, 2):
-        rows = rows[(points[rows, axis] >= lower[axis]) & (points[rows, axis] <= upper[axis])]
-    return rows
+    own = session.points_world(document)[trunk.points]
+    return blocks_of(session, document).in_box(own.min(axis=0) - distance, own.max(axis=0) + distance)
+
+
+def _reach_of_stem_m(settings: TrunkSettings) -> float:
+    """How far from a click the points of the stem may be, in plan; a little more than is looked at."""
+    return 0.5e-2 * settings.max_diameter_cm + 1.5

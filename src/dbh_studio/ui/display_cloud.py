@@ -9,11 +9,13 @@ import numpy as np
 from dbh_studio.core.arrays import Float32, Int32, Int64, UInt8
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.display import height_colours, rough_heights, sample_for_display
-from dbh_studio.core.picking import PickCloud
+from dbh_studio.core.picking import PickCloud, PickHit
 from dbh_studio.core.trunks import TrunkSet
 
 CROWN_ABOVE_M = 6.0
 _COLOURS_TO_M = 12.0
+# How much of what lies under the cursor must belong to one trunk for a click to mean that trunk.
+_MIN_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,3 +80,9 @@ class DisplayCloud:
                 at = np.minimum(np.searchsorted(trunk.points, points), len(trunk) - 1)
                 ids[trunk.points[at] == points] = trunk.id
         return ids
+
+    def trunk_under(self, hit: PickHit, trunks: TrunkSet) -> int | None:
+        """The trunk that most of what was picked belongs to; None where little of it is of any trunk."""
+        labels = self.trunk_ids(hit.surface, trunks)
+        ids, counts = np.unique(labels[labels > 0], return_counts=True)
+        return int(ids[counts.argmax()]) if len(ids) and counts.max() >= _MIN_SHARE * len(labels) else None

@@ -98,6 +98,7 @@ class SceneView:
         self._mode: ColourMode = "Original"
         self._labels_on = True
         self._crowns_on = True
+        self._others_on = True
         self._point_size, self._size_factor = 0.02, 1.0
         self._clouds: list[Any] = []
         self._later: dict[ColourMode, UInt8] = {}
@@ -304,6 +305,7 @@ class SceneView:
             self._marked = self._ring = None
             if trunk is not None and len(trunk.points):
                 self._marked = self._add_trunk("/highlight", trunk, HIGHLIGHT_YELLOW, 2 * _PER_TREE, _MARKED_SIZE)
+                self._marked.visible = self._others_on
             if ring is not None and len(ring) > 2:
                 segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)
                 self._ring = self._scene.add_line_segments(
@@ -343,7 +345,7 @@ class SceneView:
                 if content is not None:
                     self._mesh = self._scene.add_glb("/mesh", content, cast_shadow=False, receive_shadow=False)
                 elif self._mesh is not None:
-                    self._mesh.visible = on
+                    self._mesh.visible = on and self._others_on
                 self._apply_visibility()
 
     # ---- how it looks
@@ -359,6 +361,16 @@ class SceneView:
         """Show or hide the tree numbers."""
         self._labels_on = on
         self._apply_visibility()
+
+    def set_others(self, on: bool) -> None:
+        """Show or hide the plot: hidden, only what is drawn of one tree for correcting it is seen, and its ring."""
+        with self._lock:
+            self._others_on = on
+            if self._marked is not None and self._marked.visible != on:
+                self._marked.visible = on
+            if self._mesh is not None and self._mesh_on:
+                self._mesh.visible = on
+            self._apply_visibility()
 
     def set_crowns(self, on: bool) -> None:
         """Show or hide what is higher than the stems' lower part."""
@@ -385,6 +397,8 @@ class SceneView:
             if parent in self._frames:
                 wanted[parent] = parent == later and not self._mesh_on
                 wanted[f"{parent}/crown"] = self._crowns_on
+        if not self._others_on:
+            wanted = {name: shown and name.count("/") > 1 for name, shown in wanted.items()}
         with self._client.atomic():
             for name, visible in wanted.items():
                 if self._frames[name].visible != visible:
@@ -424,6 +438,10 @@ class SceneView:
         centre, radius = self._display.centre_and_radius()
         height = 1.1 * radius / min(self._half_width(), float(np.tan(_FOV_RAD / 2))) + 8.0
         self._move(centre + np.array([0.0, -1e-3, height]), centre, up=(0.0, 1.0, 0.0))
+
+    def look_down(self, target: Float64, distance: float) -> None:
+        """Straight down on a place, north up."""
+        self._move(target + np.array([0.0, -1e-3 * distance, distance]), target, up=(0.0, 1.0, 0.0))
 
     def look_from_side(self) -> None:
         """Level, from the south, at stem height."""
