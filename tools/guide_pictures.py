@@ -30,10 +30,11 @@ import browser  # noqa: E402
 import mask_plots  # noqa: E402
 import scale_plots  # noqa: E402
 
-from dbh_studio.app.commands import change_settings  # noqa: E402
+from dbh_studio.app.commands import change_settings, correct_measurement  # noqa: E402
 from dbh_studio.app.demo import demo_plot  # noqa: E402
 from dbh_studio.app.doctor import find_chromium  # noqa: E402
 from dbh_studio.core.cloud import PointCloud  # noqa: E402
+from dbh_studio.core.corrections import Correction  # noqa: E402
 from dbh_studio.core.dbh import DbhEstimate  # noqa: E402
 from dbh_studio.io.ply import write_ply  # noqa: E402
 from dbh_studio.io.reader import read_reconstruction  # noqa: E402
@@ -46,6 +47,8 @@ PATIENCE_S = 300.0
 PANEL = "the panel"
 OF_SCALE = ("scale", "corners", "photos", "markers")
 OF_MASKS = ("masks", "label-count")
+OF_REVIEW = ("review", "draw-in-section", "describe")
+OF_EDITING = ("edit-lasso", "edit-plane", "edit-slice", "edit-keys")
 # White, the curves, the tape, the ring, the marks of good, fair, poor and refused, the bars of the hints.
 KEPT = [ImageColor.getrgb(c) for c in (
     "#ffffff", "#1864ab", "#5f3dc4", "#d9480f", "#0b7285", "#a61e8c", "#e8590c", "#143cbe", "#2b8a3e",
@@ -317,13 +320,95 @@ def tour(camera: Photographer, folder: Path) -> None:
     if partly:
         camera.choose(partly[0])
         camera.take("poor")
+    if not camera.wanted or set(camera.wanted) & set(OF_REVIEW):
+        of_review(camera, good)
     no_diameter(camera)
     page.click("#dbh-view button[data-look=plot]")
     page.click("#dbh-view button[data-mode='Segmentation (by tree)']")
     camera.step("export")
     camera.take("export")
+    if not camera.wanted or set(camera.wanted) & set(OF_EDITING):
+        of_editing(camera, good[0])
     if not camera.wanted or "steps" in camera.wanted:
         lost_trees(camera)
+
+
+def of_review(camera: Photographer, good: list[int]) -> None:
+    """Trees looked through, one corrected since, points drawn round in a section, three described at once; undone."""
+    page, session = camera.page, camera.studio.session
+    assert session is not None and session.saver is not None
+    before, author = session.document, session.saver._author
+    session.saver._author = ""  # of whoever makes the pictures
+    camera.choose(good[0])
+    for _ in range(3):
+        page.keyboard.press("Space")
+        camera.settle(1.0)
+    session.do(correct_measurement(good[0], Correction("tape", round(session.measurement(good[0]).result.dbh_cm, 1))))
+    session.do(correct_measurement(good[0], Correction("breast_height", 1.8, why="branch stub")))
+    camera.choose(good[0])
+    camera.take("review")
+    page.click("button[data-draw=out]")
+    box = page.locator(".dbh-section").bounding_box()
+    page.mouse.move(box["x"] + 0.72 * box["width"], box["y"] + 0.1 * box["height"])
+    page.mouse.down()
+    for x, y in ((0.95, 0.3), (0.96, 0.65), (0.8, 0.62), (0.7, 0.3)):
+        page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"], steps=6)
+    camera.take("draw-in-section", clip=".dbh-card")
+    page.keyboard.press("Escape")
+    page.mouse.up()
+    page.click(f"tr[data-id='{good[1]}']")
+    page.click(f"tr[data-id='{good[3]}']", modifiers=["Shift"])
+    page.get_by_text("About this tree").click()
+    camera.show_text("Species", "oak")
+    page.get_by_role("button", name="Keep", exact=True).scroll_into_view_if_needed()
+    camera.settle(1.0)
+    camera.take("describe", clip=PANEL)
+    camera.show_text("Species", "")
+    page.get_by_text("About this tree").click()
+    camera.settle(1.0)
+    while session.document is not before:
+        session.undo()
+    session.saver._author = author
+    camera.settle()
+
+
+def of_editing(camera: Photographer, tree: int) -> None:
+    """Points about a trunk under the lasso, a cut by a plane, a slice from above, the keys; nothing is changed."""
+    page, session = camera.page, camera.studio.session
+    assert session is not None
+    stem = session.measurement(tree)
+    target = np.array([*stem.xy_m, stem.z_ground_m + 1.3])
+    camera.step("inspect")
+    page.click("#dbh-view button[data-mode='Segmentation (red)']")
+    camera.choose(tree)
+    page.get_by_role("button", name=f"Correct tree {tree}").click()
+    page.wait_for_selector("#dbh-edit .chosen")
+    camera.look_at(target, np.array([0.4, -3.2, 0.5]))
+    page.click("#dbh-edit button[data-edit=tool-lasso]")
+    camera.settle()
+    x, y = browser.pixel_of(page, target)
+    page.mouse.move(x, y - 90)
+    page.mouse.down()
+    for off in ((100, -90), (120, 0), (100, 90), (0, 90), (0, -80)):
+        page.mouse.move(x + off[0], y + off[1], steps=8)
+    page.mouse.up()
+    camera.until(lambda: len(camera.tab.editing.points))
+    camera.settle(8.0)
+    camera.take("edit-lasso")
+    page.click("#dbh-edit button[data-edit=tool-plane]")
+    camera.settle(8.0)
+    camera.take("edit-plane")
+    page.click("#dbh-edit button[data-edit=tool-click]")
+    page.click("#dbh-edit input[data-edit=slice]")
+    page.click("#dbh-edit button[data-edit=above]")
+    camera.settle(8.0)
+    camera.take("edit-slice")
+    page.click("#dbh-edit button[data-edit=keys]")
+    camera.settle(8.0)
+    camera.take("edit-keys", clip="#dbh-edit")
+    page.click("#dbh-edit button[data-edit=keys]")
+    page.click("#dbh-edit button[data-edit=close]")
+    camera.settle()
 
 
 def no_diameter(camera: Photographer) -> None:

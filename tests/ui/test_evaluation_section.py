@@ -153,3 +153,18 @@ def test_in_the_page_a_point_is_pressed_and_the_tree_is_chosen(studio, field, tm
     point.click(force=True)
     page.locator(f'.dbh-card[data-tree="{number}"]').wait_for(timeout=browser.TIMEOUT_MS)
     assert browser.page_errors(page) == []
+
+
+def test_field_values_are_kept_beside_the_estimates_and_taken_back(measured, studio, field):
+    compare(measured, field)
+    document = studio.session.document
+    before = {row.stem_id: row.dbh_cm for row in studio.session.inventory()}
+    measured.press("Keep these as tape values of the trees")
+    measured.wait(lambda _: studio.session.document is not document)
+    rows = {row.stem_id: row for row in studio.session.inventory()}
+    assert all(row.field_tape_cm == pytest.approx(row.dbh_cm, rel=0.08) for row in rows.values())
+    assert {i: row.dbh_cm for i, row in rows.items()} == before
+    (tape,) = studio.session.document.record(next(iter(rows))).corrections
+    assert (tape.who, tape.why) == (studio.session.author, "field.csv")
+    studio.session.undo()
+    assert studio.session.document is document

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import plots
 import pyogrio
+from fakeclient import FakeClient
 from panel import LONG
 
 from dbh_studio.app import commands
+from dbh_studio.app.opening import open_plot
 
 TITLE = "Write the files"
 
@@ -77,3 +80,31 @@ def test_nothing_chosen_is_said(measured, tmp_path):
         measured.set(box, False)
     measured.press(TITLE)
     measured.wait(lambda t: any("No file was chosen" in note.body + note.title for note in t.notifications), LONG)
+
+
+def test_report_page_and_log_are_written_and_a_polygon_is_read(measured, tmp_path):
+    to_export(measured)
+    (tmp_path / "corners.txt").write_text("0 0\n1000 0\n1000 1000\n0 1000\n")
+    measured.set("Folder", str(tmp_path / "out"))
+    for box in ("Inventory (CSV)", "Map layer (GeoPackage)", "Excel, with stand table"):
+        measured.set(box, False)
+    for box in ("Report (HTML)", "3D page (HTML)", "Edit log (CSV)"):
+        measured.set(box, True)
+    measured.set("Plot area", "polygon")
+    measured.wait(lambda t: t.has("File with corners"), LONG)
+    measured.press(TITLE)
+    measured.wait(lambda t: any("No file with corners" in note.body + note.title for note in t.notifications), LONG)
+    measured.set("File with corners", str(tmp_path / "corners.txt"))
+    measured.press(TITLE)
+    measured.wait_text("Written to", LONG)
+    names = sorted(path.name.split("_")[-1] for path in (tmp_path / "out").iterdir())
+    assert names == ["3d.html", "edits.csv", "report.html"]
+
+
+def test_there_is_nothing_to_download_before_trunks_are_found(studio, tmp_path):
+    studio.adopt(open_plot(plots.write_laz(tmp_path), project_dir=tmp_path / "plot.dbh"))
+    with FakeClient(studio.server.url) as tab:
+        tab.wait_text("Press Find trunks", LONG)
+        tab.bridge_send("step", "export")
+        tab.wait_text("nothing to export yet", LONG)
+        assert not tab.has("Download the inventory (CSV)") and not tab.has(TITLE)

@@ -8,10 +8,10 @@ import pytest
 from dbh_studio.core.dbh import DbhEstimate, Refusal, measure_stem
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.settings import MeasureSettings
-from dbh_studio.ui import html
-from dbh_studio.ui.html import TableRow
+from dbh_studio.ui import html, tree_card
 from dbh_studio.ui.section_svg import section_svg
 from dbh_studio.ui.steps import PlotStatus
+from dbh_studio.ui.tree_table import TableRow, tree_table
 
 FOURIER = MeasureSettings(curve="fourier", definition="curve")
 ATTACK = "<img src=x onerror=alert(1)>\"'`"
@@ -52,14 +52,14 @@ def ids_in(content: str) -> list[int]:
 
 
 def test_the_card_shows_the_number_and_where_it_was_measured(estimate):
-    card = html.tree_card(7, estimate)
+    card = tree_card.tree_card(7, estimate)
     assert "Tree 7" in card
     assert 'data-dbh="30.0"' in card
     assert "1.22 to 1.52 m" in card
 
 
 def test_a_refused_tree_shows_reason_and_remedy_and_no_number():
-    card = html.tree_card(7, Refusal("small_arc", "only 40° were seen.", "Walk round it."))
+    card = tree_card.tree_card(7, Refusal("small_arc", "only 40° were seen.", "Walk round it."))
     assert "Only 40° were seen." in card
     assert "Walk round it." in card
     assert "data-dbh" not in card
@@ -85,24 +85,24 @@ def test_an_unknown_diameter_is_a_dash_never_zero():
     ],
 )
 def test_sorting_keeps_unknown_values_at_the_end(column, descending, expected):
-    table = html.tree_table(rows(), selected=None, column=column, descending=descending)
+    table = tree_table(rows(), selected=None, column=column, descending=descending)
     assert ids_in(table) == expected
 
 
 def test_the_selected_row_is_marked():
-    table = html.tree_table(rows(), selected=10, column="id", descending=False)
+    table = tree_table(rows(), selected=10, column="id", descending=False)
     assert re.findall(r'data-id="(\d+)" data-selected="true"', table) == ["10"]
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        html.tree_table([TableRow(1, 1.0, ATTACK, 1.0, ATTACK)], selected=None, column="id", descending=False),
+        tree_table([TableRow(1, 1.0, ATTACK, 1.0, ATTACK)], selected=None, column="id", descending=False),
         html.header(ATTACK, PlotStatus(), "open", saved=ATTACK, undo=ATTACK, redo=ATTACK),
         html.message(ATTACK, level=ATTACK, remedy=ATTACK),
         html.findings([(ATTACK, ATTACK, ATTACK)]),
         html.facts([(ATTACK, ATTACK)]),
-        html.tree_card(1, Refusal("x", ATTACK, ATTACK)),
+        tree_card.tree_card(1, Refusal("x", ATTACK, ATTACK)),
         html.job_box(ATTACK),
     ],
     ids=["table", "header", "message", "findings", "facts", "card", "job"],
@@ -204,7 +204,7 @@ def test_every_curve_can_be_chosen_in_the_legend(estimate):
 
 
 def test_the_card_says_the_interval_in_brackets(half_seen):
-    card = html.tree_card(7, half_seen)
+    card = tree_card.tree_card(7, half_seen)
     low, high = half_seen.interval
     assert f"<b>{half_seen.dbh_cm:.1f}</b>" in card
     assert f">cm ({low:.1f}–{high:.1f})</small>" in card
@@ -214,7 +214,7 @@ def test_the_card_says_the_interval_in_brackets(half_seen):
 
 
 def test_a_method_without_an_interval_says_so(estimate):
-    card = html.tree_card(7, estimate)
+    card = tree_card.tree_card(7, estimate)
     assert ">cm</small>" in card
     assert "none: this method has none" in card
 
@@ -228,9 +228,9 @@ def test_a_method_without_an_interval_says_so(estimate):
     ],
 )
 def test_the_card_says_whether_the_scale_is_in_the_interval(half_seen, scale, words):
-    said = html.scale_words(scale)
+    said = tree_card.scale_words(scale)
     assert (words in said) if words else said == ""
-    assert said in html.tree_card(7, half_seen, scale=said)
+    assert said in tree_card.tree_card(7, half_seen, scale=said)
 
 
 def test_the_unseen_arc_is_dashed_and_the_interval_a_band(half_seen):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from panel import LONG, choose, find_trunks, idle, table_ids
 
 from dbh_studio.app import commands
 from dbh_studio.app.opening import open_plot
+from dbh_studio.app.session import Session
 from dbh_studio.errors import ProjectError, StudioError
 from dbh_studio.io.project import read_project
 from dbh_studio.ui.studio import RunningJob, Studio, project_dir_for
@@ -156,15 +158,24 @@ def test_a_file_of_the_same_name_would_be_saved_in_the_same_place(
     assert studio._job is None
 
 
-def disk_full(*_: Any, **__: Any) -> None:
-    raise ProjectError("The disk is full.", "Make room.")
+def fill_disk(session: Session, patch: pytest.MonkeyPatch) -> None:
+    """Neither the plot nor its undo log can be written."""
+
+    def full(*_: Any, **__: Any) -> None:
+        raise ProjectError("The disk is full.", "Make room.")
+
+    def no_room(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    patch.setattr(session.saver._writer, "save", full)
+    patch.setattr(session.saver._writer.undo_log, "_write", no_room)
 
 
 def test_a_plot_that_cannot_be_saved_is_not_closed_for_another(
     measured: FakeClient, studio: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = studio.session
-    monkeypatch.setattr(before.saver._writer, "save", disk_full)
+    fill_disk(before, monkeypatch)
     before.do(commands.delete_trunk(before.document.trunks.ids[0]))
     (tmp_path / "other").mkdir()
     path = plots.write_laz(tmp_path / "other", "other.laz")
@@ -186,7 +197,7 @@ def test_that_a_plot_is_not_saved_is_told_once_and_then_shown(
     measured: FakeClient, studio: Studio, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = studio.session
-    monkeypatch.setattr(session.saver._writer, "save", disk_full)
+    fill_disk(session, monkeypatch)
     for trunk_id in session.document.trunks.ids[:3]:
         session.do(commands.delete_trunk(trunk_id))
         assert not session.saver.flush()

@@ -185,6 +185,10 @@ class TabWorker:
         """Whether work is waiting."""
         return bool(self._queue)
 
+    def is_run_by(self, thread: threading.Thread) -> bool:
+        """Whether `thread` is the one that does this tab's work."""
+        return thread is self._thread
+
     @property
     def closed(self) -> bool:
         """Whether the tab has gone."""

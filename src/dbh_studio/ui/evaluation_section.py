@@ -15,6 +15,7 @@ from dbh_studio.errors import StudioError
 from dbh_studio.ui import html
 from dbh_studio.ui.bridge import call, esc
 from dbh_studio.ui.panels.base import set_content, set_value, set_visible, typed_path
+from dbh_studio.ui.signed import utc_now
 
 if TYPE_CHECKING:
     from dbh_studio.app.document import Document
@@ -52,6 +53,14 @@ class EvaluationSection:
             self._state = gui.add_html("")
             self._plot = gui.add_html("", visible=False)
             self._worst = gui.add_html("", visible=False)
+            self._tapes = gui.add_button(
+                "Keep these as tape values of the trees",
+                icon=viser.Icon.RULER_MEASURE,
+                color="gray",
+                visible=False,
+                hint="beside the estimates, never mixed with them; Undo takes it back",
+            )
+            worker.on_click(self._tapes, self._keep_tapes)
             self._out = gui.add_text(
                 "Report folder", "", visible=False, hint="table, pairs and figures are written there, on this computer"
             )
@@ -66,7 +75,7 @@ class EvaluationSection:
             self._shown_for, self._done = session, None
             for field in (self._path, self._out):
                 set_value(field, "")
-        for handle in (self._plot, self._worst, self._out, self._write):
+        for handle in (self._plot, self._worst, self._tapes, self._out, self._write):
             set_visible(handle, self._done is not None)
         if self._done is None or session is None:
             set_content(
@@ -102,6 +111,19 @@ class EvaluationSection:
         finally:
             self.refresh()
 
+    def _keep_tapes(self) -> None:
+        """Keep the field value of every tree that has a pair, refused ones among them."""
+        from dbh_studio.app.section_edits import keep_tapes
+
+        if self._done is None:
+            raise StudioError("Nothing was compared yet.", "Press Compare first.")
+        session, _, request, comparison = self._done
+        tapes = paired_tapes_cm(comparison)
+        session.do(keep_tapes(tapes, who=session.author, when=utc_now(), why=request.reference.name))
+        self.tab.worker.notify(
+            f"{len(tapes)} tape values kept", "They stand beside the estimates, in step 4.", "success"
+        )
+
     def _write_report(self) -> None:
         from dbh_studio.app.evaluation import section_pictures, write_report
 
@@ -129,6 +151,16 @@ def _beside(session: Session) -> Path:
     """The folder the plot lies in."""
     folder = getattr(session.saver, "folder", None)
     return Path(folder if folder is not None else session.document.source.path).absolute().parent
+
+
+def paired_tapes_cm(comparison: Comparison) -> dict[int, float]:
+    """The field diameter of each tree of the plot that was found in the field table, cm."""
+    numbers = _numbers(comparison)
+    return {
+        numbers[sample.stem]: float(sample.reference_cm)
+        for sample in comparison.samples
+        if sample.reference_cm is not None and sample.stem in numbers
+    }
 
 
 def _whole(comparison: Comparison) -> Line:

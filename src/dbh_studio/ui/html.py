@@ -2,47 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from importlib import resources
-from itertools import zip_longest
 
-import numpy as np
-
-from dbh_studio.core.dbh import DbhEstimate, Diameter, Refusal
-from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.section_drawing import CURVE_TITLES as CURVE_TITLES
 from dbh_studio.ui.bridge import call, esc, js
 from dbh_studio.ui.steps import STEP_TITLES, PlotStatus, StepName
 
-# Each table column: key, heading, tooltip, whether it is text.
-TABLE_COLUMNS: tuple[tuple[str, str, str, bool], ...] = (
-    ("id", "Tree", "Tree number", False),
-    ("dbh", "DBH cm", "Diameter at breast height", False),
-    (
-        "quality",
-        "Quality",
-        "From the width of the interval; of the paper's curves from arc, residual and agreement",
-        True,
-    ),
-    ("arc", "Arc °", "How much of the ring was seen", False),
-    ("remark", "Remark", "Species, note, what to look at, or why there is no diameter", True),
-)
 # A script may arrive together with the HTML it is about, and the page draws that a moment later.
-_NOW_AND_ONCE_DRAWN = "f();setTimeout(f,80);"
-CURVE_TITLES: Mapping[str, str] = {
-    "shrinkage": "Shrinkage curve",
-    "circle": "Circle",
-    "fourier": "Fourier",
-    "ellipse": "Ellipse",
-    "bspline": "B-spline",
-}
+NOW_AND_ONCE_DRAWN = "f();setTimeout(f,80);"
 
 
-def style_js() -> str:
-    """JavaScript that adds the style sheet to the page once."""
-    style = resources.files("dbh_studio.ui").joinpath("style.css").read_text(encoding="utf-8")
+def style_js(name: str = "style") -> str:
+    """JavaScript that adds a style sheet of this package to the page once."""
+    style = resources.files("dbh_studio.ui").joinpath(f"{name}.css").read_text(encoding="utf-8")
     return (
-        "if(!document.getElementById('dbh-style')){const s=document.createElement('style');s.id='dbh-style';"
+        f"if(!document.getElementById('dbh-{name}')){{const s=document.createElement('style');s.id='dbh-{name}';"
         f"s.textContent={js(style)};document.head.appendChild(s);}}"
     )
 
@@ -132,7 +107,7 @@ def job_js(fraction: float, message: str) -> str:
     return (
         "(()=>{const f=()=>{const b=document.querySelector('.dbh-job');if(!b)return;"
         f"b.querySelector('.dbh-bar div').style.width={width};b.querySelector('.dbh-job-text').textContent={text};}};"
-        f"{_NOW_AND_ONCE_DRAWN}}})()"
+        f"{NOW_AND_ONCE_DRAWN}}})()"
     )
 
 
@@ -155,201 +130,6 @@ def facts(pairs: Sequence[tuple[str, str]]) -> str:
     """A two-column list of names and values."""
     rows = "".join(f"<dt>{esc(name)}</dt><dd>{esc(value)}</dd>" for name, value in pairs)
     return f'<dl class="dbh-facts">{rows}</dl>'
-
-
-DEFINITION_TITLES = {"curve": "perimeter / π", "tape": "tape: convex girth / π", "area": "equal-area circle"}
-
-
-def no_tree_card() -> str:
-    """In place of a card while no tree is chosen."""
-    return '<div class="dbh muted dbh-empty">No tree is chosen.</div>'
-
-
-def waiting_card(tree_id: int) -> str:
-    """The card of a tree that is yet to be measured."""
-    return (
-        f'<div class="dbh dbh-card" data-tree="{tree_id}"><div class="dbh-number">{_card_title(tree_id)}</div>'
-        '<div class="muted">Not measured yet.</div></div>'
-    )
-
-
-def _card_title(tree_id: int) -> str:
-    """The tree's number, and the arrows to its neighbours."""
-    before, after = (
-        f'<button type="button" data-do="{tip}" title="{tip} tree ({key})" '
-        f'onclick="{call("neighbour", n)}">{arrow}</button>'
-        for tip, key, n, arrow in (("Previous", "P", -1, "&#9664;"), ("Next", "N", 1, "&#9654;"))
-    )
-    return f'<h3>Tree {tree_id}</h3><span class="dbh-neighbours">{before}{after}</span>'
-
-
-def tree_card(tree_id: int, result: DbhEstimate | Refusal, *, section: str = "", scale: str = "") -> str:
-    """What the forester reads after clicking a trunk.
-
-    Args:
-        tree_id: Its number.
-        result: The diameter, or why there is none.
-        section: The picture of the cross-section, see `section_svg`.
-        scale: What of the scale's error is in the interval, see `scale_words`.
-    """
-    title = _card_title(tree_id)
-    if isinstance(result, Refusal):
-        return (
-            f'<div class="dbh dbh-card" data-tree="{tree_id}"><div class="dbh-number">{title}'
-            f'<b class="none">no diameter</b></div>'
-            f'<div class="dbh-hint" data-level="stop">{esc(plain(result.reason))}'
-            f"<br><b>What to do:</b> {esc(plain(result.remedy))}</div>{section}</div>"
-        )
-    flags = "".join(
-        f'<li data-level="warn" data-flag="{esc(code)}">{esc(plain(flag))}</li>'
-        for code, flag in zip_longest(result.flag_codes, result.flags, fillvalue="")
-    )
-    tip = "in 9 of 10 cases the tape reads within these" if result.interval else "this method gives no interval"
-    interval = f" {_range(result.diameters[result.definition])}" if result.interval else ""
-    return (
-        f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><div class="dbh-number">'
-        f'{title}<b>{result.dbh_cm:.1f}</b><small title="{tip}">cm{interval}</small>'
-        f'<span class="dbh-badge" data-quality="{esc(result.quality)}">{esc(result.quality)}</span></div>'
-        f"{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(_card_facts(result))}"
-        f"<details><summary>How it was measured</summary>{facts(_measuring_facts(result, scale))}</details></div>"
-    )
-
-
-def _card_facts(result: DbhEstimate) -> list[tuple[str, str]]:
-    """What one compares with the tree in the forest."""
-    cut, girth = result.section, result.diameters["tape"]
-    round_cm = [np.pi * value for value in (girth.value_cm, girth.low_cm, girth.high_cm) if value is not None]
-    pairs = [
-        ("Measured at", f"{cut.hom_m:.2f} m"),
-        ("Tape round it", _in_brackets(round_cm) + " cm"),
-        ("Ring seen", f"{cut.coverage_deg:.0f}°, largest gap {cut.max_gap_deg:.0f}°"),
-        ("Lean", f"{cut.lean_deg:.0f}°"),
-    ]
-    if result.taper_cm_per_m is not None:
-        pairs.append(("Taper", f"{result.taper_cm_per_m:.1f} cm per metre"))
-    return pairs
-
-
-def _measuring_facts(result: DbhEstimate, scale: str) -> list[tuple[str, str]]:
-    """How the diameter was read, and what it would be by another definition."""
-    low, high = result.section.band_m
-    others = [f"{DEFINITION_TITLES[name]} {_with_range(diameter)}" for name, diameter in result.diameters.items()]
-    return [
-        ("Read from", f"{CURVE_TITLES.get(result.curve, result.curve)}, {_definition(result)}"),
-        ("Interval", f"90 %{scale}" if result.interval else "none: this method has none that is honest"),
-        ("By definition", ", ".join(others)),
-        ("Scatter", f"{result.rmse_mm:.1f} mm about the curve, {result.n_points:,} points"),
-        ("Shown", f"the stretch from {low:.2f} to {high:.2f} m"),
-    ]
-
-
-def scale_words(scale: ScaleEstimate) -> str:
-    """What of the scale's error is in the interval, to follow “90 %”."""
-    if scale.standard_error:
-        return f", the ±{100 * scale.relative_sd:.2g} % of the scale included"
-    exact = scale.source in ("metres", "feet", "millimetres") or scale.standard_error == 0
-    return "" if exact else ", without the error of the scale, which is not known"
-
-
-def _with_range(diameter: Diameter) -> str:
-    ends = [diameter.value_cm, diameter.low_cm, diameter.high_cm]
-    return _in_brackets([value for value in ends if value is not None])
-
-
-def _range(diameter: Diameter) -> str:
-    return f"({diameter.low_cm:.1f}–{diameter.high_cm:.1f})"
-
-
-def _in_brackets(values: Sequence[float]) -> str:
-    return f"{values[0]:.1f}" + (f" ({values[1]:.1f}–{values[2]:.1f})" if len(values) == 3 else "")
-
-
-def _definition(result: DbhEstimate) -> str:
-    return DEFINITION_TITLES.get(result.definition, result.definition)
-
-
-@dataclass(frozen=True)
-class TableRow:
-    """One line of the table of trees."""
-
-    id: int
-    dbh_cm: float | None
-    quality: str
-    arc_deg: float | None
-    remark: str
-
-    def cells(self) -> tuple[str, ...]:
-        """The texts shown; an unknown diameter is a dash, never 0."""
-        return (
-            str(self.id),
-            "–" if self.dbh_cm is None else f"{self.dbh_cm:.1f}",
-            self.quality or "–",
-            "–" if self.arc_deg is None else f"{self.arc_deg:.0f}",
-            self.remark,
-        )
-
-    def sort_key(self, column: str) -> tuple[bool, float | str]:
-        """Unknown values last, whatever the column."""
-        order = {"good": 0.0, "fair": 1.0, "poor": 2.0, "": 3.0}
-        keys: dict[str, float | str | None] = {
-            "id": float(self.id),
-            "dbh": self.dbh_cm,
-            "quality": order.get(self.quality, 3.0),
-            "arc": self.arc_deg,
-            "remark": self.remark.lower(),
-        }
-        value = keys.get(column, float(self.id))
-        return (value is None, 0.0 if value is None else value)
-
-
-def sort_rows(rows: Sequence[TableRow], column: str, *, descending: bool) -> list[TableRow]:
-    """Rows by one column; rows without a value stay at the end either way."""
-    known = [row for row in rows if not row.sort_key(column)[0]]
-    unknown = [row for row in rows if row.sort_key(column)[0]]
-    return sorted(known, key=lambda row: row.sort_key(column)[1], reverse=descending) + unknown
-
-
-def tree_table(rows: Sequence[TableRow], *, selected: int | None, column: str, descending: bool) -> str:
-    """The table of all trees. Choosing a row or a heading sends ``row`` or ``sort`` to the server."""
-    arrow = " &#9660;" if descending else " &#9650;"
-    heads = "".join(
-        f'<th class="{"text" if is_text else ""}" title="{esc(tip)}" onclick="{call("sort", key)}">'
-        f"{esc(title)}{arrow if key == column else ''}</th>"
-        for key, title, tip, is_text in TABLE_COLUMNS
-    )
-    body = "".join(
-        f'<tr data-id="{row.id}" data-selected="{"true" if row.id == selected else "false"}" '
-        f'data-quality="{esc(row.quality or "none")}" onclick="{call("row", row.id)}">'
-        + "".join(
-            f'<td class="{"text" if is_text else ""}" data-column="{key}"'
-            f"{f' title={chr(34)}{esc(cell)}{chr(34)}' if key == 'remark' else ''}>{esc(cell)}</td>"
-            for cell, (key, _, _, is_text) in zip(row.cells(), TABLE_COLUMNS, strict=True)
-        )
-        + "</tr>"
-        for row in sort_rows(rows, column, descending=descending)
-    )
-    if not rows:
-        return message("No trunks yet. Press Find trunks in step 3.")
-    return (
-        '<div class="dbh"><div class="dbh-scroll" tabindex="0"><table class="dbh-table">'
-        f"<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div></div>"
-    )
-
-
-def select_row_js(tree_id: int | None) -> str:
-    """JavaScript that moves the table's highlight without replacing the table, so that its scroll position stays.
-
-    Only the table scrolls to the row: the panel around it stays where the person left it.
-    """
-    wanted = js(None if tree_id is None else str(tree_id))
-    return (
-        f"(()=>{{const id={wanted},f=()=>{{document.querySelectorAll('.dbh-table tr[data-id]').forEach(r=>{{"
-        "const on=r.dataset.id===id;r.dataset.selected=on;if(!on)return;"
-        "const box=r.closest('.dbh-scroll'),head=box.querySelector('thead').offsetHeight;"
-        "if(r.offsetTop<box.scrollTop+head)box.scrollTop=r.offsetTop-head;"
-        "else if(r.offsetTop+r.offsetHeight>box.scrollTop+box.clientHeight)"
-        f"box.scrollTop=r.offsetTop+r.offsetHeight-box.clientHeight;}});}};{_NOW_AND_ONCE_DRAWN}}})()"
-    )
 
 
 def view_bar_js(modes: Sequence[tuple[str, str]], mode: str, looks: Sequence[tuple[str, str, str]]) -> str:

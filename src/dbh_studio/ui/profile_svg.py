@@ -11,12 +11,13 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 40, 10, 10, 26
 _CURVE, _HERE = "#1864ab", "#2b8a3e"
 
 
-def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float) -> str:
+def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float, tree_id: int | None = None) -> str:
     """The picture; empty with fewer than two diameters.
 
     Args:
         profile: From `core.stem_profile.stem_profile`.
         height_m: Breast height, which is marked.
+        tree_id: Whose it is: breast height may then be dragged, see `section_tools.js`.
     """
     rows = [(point.height_m, point.diameter) for point in profile if point.diameter is not None]
     if len(rows) < 2:
@@ -45,10 +46,25 @@ def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float) -> str:
         f'<svg class="dbh-profile" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="Diameters along the stem">'
         f'<path data-intervals d="{bars}" stroke="{_CURVE}" stroke-width="3" opacity="0.35"/>'
         f'<polyline data-profile points="{line}" fill="none" stroke="{_CURVE}" stroke-width="2"/>'
-        f'<path d="M{x(height_m):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{_HERE}" stroke-dasharray="4 3"/>'
+        f"{_breast_height(x(height_m), height_m, f'{bottom:.4f} {top:.4f}', tree_id)}"
         f'<text x="2" y="{_TOP + 10}" {text}>{high:.0f} cm</text>'
         f'<text x="2" y="{_HEIGHT - _BOTTOM}" {text}>{low:.0f} cm</text>'
         f'<text x="{_LEFT}" y="{_HEIGHT - 8}" {text}>{bottom:.1f} m</text>'
         f'<text x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 8}" text-anchor="end" {text}>{top:.1f} m above ground</text>'
         "</svg>"
+    )
+
+
+def _breast_height(x_px: float, height_m: float, ends_m: str, tree_id: int | None) -> str:
+    """The line at breast height; with a grip where it may be dragged."""
+    line = f'<path d="M{x_px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{_HERE}" stroke-dasharray="4 3"/>'
+    if tree_id is None:
+        return line
+    return (
+        f'<g data-height-grip data-tree="{tree_id}" data-height="{height_m:.3f}" data-x="{x_px:.1f}" '
+        f'data-scale="{_LEFT} {_WIDTH - _RIGHT} {ends_m}" style="cursor:ew-resize"><title>Drag breast height of this '
+        f'tree</title><path d="M{x_px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="#fff" stroke-opacity="0" '
+        f'stroke-width="22"/>{line}<circle cx="{x_px:.1f}" cy="{_HEIGHT - _BOTTOM}" r="7" fill="{_HERE}"/>'
+        f'<text x="{x_px:.1f}" y="{_TOP + 2}" text-anchor="middle" font-size="12" font-family="sans-serif" '
+        f'fill="{_HERE}">{height_m:.2f} m</text></g>'
     )

@@ -25,6 +25,7 @@ class PlotStatus:
     n_measured: int = 0
     n_waiting: int = 0
     n_inspected: int = 0
+    n_reviewed: int = 0
     is_exported: bool = False
     has_photos: bool = False
 
@@ -34,7 +35,7 @@ class PlotStatus:
             "open": self.has_plot,
             "scale": self.has_plot and self.is_scaled,
             "trunks": self.n_trunks > 0,
-            "inspect": self.n_inspected > 0,
+            "inspect": self.n_inspected > 0 or 0 < self.n_trunks <= self.n_reviewed,
             "export": self.is_exported,
         }
         return frozenset(name for name, is_done in reached.items() if is_done)
@@ -57,7 +58,8 @@ class PlotStatus:
             else "This cloud has no scale yet. Mark a length you know, or say how long one unit of it is.",
             "trunks": "Press Find trunks.",
             "inspect": f"{self.n_trunks} trunks found{refused}. Click a trunk in the picture or a row in the table.",
-            "export": f"{self.n_measured} of {self.n_trunks} trees measured. Look through them, then export.",
+            "export": f"{self.n_measured} of {self.n_trunks} trees measured, {self.n_reviewed} reviewed. "
+            + ("Export them." if self.n_reviewed >= self.n_trunks else "Space accepts a tree."),
         }
         if self.done() >= set(STEP_TITLES):
             return "The inventory has been exported. Changes after that are not in the file."

@@ -24,7 +24,7 @@ from dbh_studio.app.opening import open_plot, plot_name, read_cloud
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.progress import Progress
 from dbh_studio.core.reconstruction import Reconstruction
-from dbh_studio.errors import CancelledError, FileError, ProjectError, StudioError
+from dbh_studio.errors import CancelledError, FileError, ProjectError, ProjectLockedError, StudioError
 from dbh_studio.io.project import FOLDER_SUFFIX, is_project
 from dbh_studio.io.reader import SUPPORTED_SUFFIXES
 from dbh_studio.ui.bind import TabWorker, for_each_tab
@@ -34,6 +34,7 @@ from dbh_studio.ui.mask_desk import MaskDesk
 from dbh_studio.ui.mask_jobs import MaskJobs
 from dbh_studio.ui.photo_desk import PhotoDesk
 from dbh_studio.ui.photo_render import PhotoCache
+from dbh_studio.ui.returning import LostPages
 from dbh_studio.ui.server import StudioServer
 from dbh_studio.ui.tab import Tab
 from dbh_studio.ui.uploads import UploadedFile, receive
@@ -43,6 +44,8 @@ log = logging.getLogger(__name__)
 DEFAULT_DISPLAY_POINTS = 3_000_000
 # Bytes of a saved plot's name; file systems allow 255 with the suffix.
 _LONGEST_NAME = 200
+# What is done in one tab is told in the others so often at most.
+_BETWEEN_NOTES_S = 2.0
 
 
 class BusyError(StudioError):
@@ -80,9 +83,13 @@ class Studio:
         self._uploads_folder = uploads_folder or Path(platformdirs.user_data_dir("dbh-studio")) / "plots"
         self._display_points = display_points
         self._tabs: dict[int, Tab] = {}
+        self.lost_pages = LostPages()
         self._job: RunningJob | None = None
         self._end_session: Callable[[], None] = lambda: None
         self._problem_told = ""
+        self._others_told_at = -_BETWEEN_NOTES_S
+        # The plot of which it was told how it was opened.
+        self._opening_told: Session | None = None
         self._exported: Document | None = None
         self._lock = threading.RLock()
         self.photo_cache = PhotoCache()
@@ -107,6 +114,8 @@ class Studio:
         worker.on_close(lambda: self._forget_tab(worker.client.client_id))
         tab.adopt_session()
         tab.show_job(self._job)
+        self._tell_of_opening(tab)
+        tab.returning.ask()
 
     def _forget_tab(self, client_id: int) -> None:
         with self._lock:
@@ -144,18 +153,30 @@ class Studio:
         end_before()
         if before is not None:
             before.close()
+        self.lost_pages.clear()
         if isinstance(session.saver, Autosave):
             session.saver.subscribe(self._save_status_changed)
         self.masks.plot_opened()
         self.mask_jobs.plot_opened()
         # First: a tab that shows the end of the job shows its step too, and a press meanwhile would be undone.
         self._each_tab(Tab.adopt_session)
+        self._each_tab(self._tell_of_opening)
         self._show_job()
         self.photos.plot_opened(session)
         self.measure_missing()
 
+    def _tell_of_opening(self, tab: Tab) -> None:
+        """Tell once what was lost, or brought back, when the plot was opened; the first step shows it all the time."""
+        session = self.session
+        if session is None or self._opening_told is session:
+            return
+        self._opening_told = session
+        for note in session.reopening_notes:
+            tab.worker.notify(f"{session.document.plot_id} was opened", note, "warning")
+
     def _save_open_plot(self) -> None:
         """Raise ProjectError where the open plot cannot be saved: closing it would lose what was done."""
+        self._keep_typed()
         try:
             if self.session is not None:
                 self.session.flush()
@@ -163,6 +184,13 @@ class Studio:
             raise ProjectError(
                 f"The open plot is kept, for it could not be saved: {error.problem}", error.remedy
             ) from None
+
+    def _keep_typed(self) -> None:
+        """Keep what was typed about trees in any tab, before the plot is closed."""
+        with self._lock:
+            tabs = list(self._tabs.values())
+        for tab in tabs:
+            tab.returning.keep_typed()
 
     def _make_display(self, session: Session) -> DisplayCloud:
         return DisplayCloud.of(
@@ -179,7 +207,21 @@ class Studio:
             self.display = self._make_display(session)
         self.photos.follow(session)
         self._each_tab(lambda tab: tab.session_changed(change))
+        self._tell_other_tabs(change)
         self.measure_missing()
+
+    def _tell_other_tabs(self, change: Change) -> None:
+        """What was done in one tab is told in the others, where somebody may be about to do the same."""
+        here = threading.current_thread()
+        with self._lock:
+            tabs = list(self._tabs.values())
+        # Not every stroke of a row of them: the notes would cover the plot.
+        is_due = time.monotonic() - self._others_told_at > _BETWEEN_NOTES_S
+        if is_due and any(tab.worker.is_run_by(here) for tab in tabs):
+            self._others_told_at = time.monotonic()
+            for tab in tabs:
+                if not tab.worker.is_run_by(here):
+                    tab.worker.notify("In another tab", f"{change.label}.", "info")
 
     def _save_status_changed(self, status: SaveStatus) -> None:
         with self._lock:
@@ -188,6 +230,8 @@ class Studio:
             tab.worker.post_latest("saved", tab.refresh_header)
         # Told once: with every edit it fails again, and the header says so all the time.
         if status.state == "saved":
+            if self._problem_told:
+                self._each_tab(lambda tab: tab.worker.notify("Saved", "All that was done is saved again.", "success"))
             self._problem_told = ""
         elif status.state == "not_saved" and status.problem != self._problem_told:
             self._problem_told = status.problem
@@ -200,7 +244,7 @@ class Studio:
             return ""
         saver = session.saver
         if not isinstance(saver, Autosave):
-            return "open for reading, changes are not saved"
+            return f"open for reading only{f', {session.held_by}' if session.held_by else ''}"
         return f"saved in {saver.folder.name}" if saver.status.state == "saved" else "saving …"
 
     def save_problem(self) -> str:
@@ -309,7 +353,7 @@ class Studio:
             return run_job(read_cloud, source, progress=progress, started=started)
 
         try:
-            session = open_plot(path, progress=progress, read=read, **options)
+            session = self._open_or_read(path, progress=progress, read=read, **options)
             try:
                 self.adopt(session)
             except BaseException:
@@ -321,6 +365,18 @@ class Studio:
         except Exception:
             log.exception("Opening %s failed", path)
             self._fail(running, StudioError("Unexpected error.", "The program's log has the details."))
+
+    @staticmethod
+    def _open_or_read(path: Path, **options: Any) -> Session:
+        """Open a plot; one that another program writes is opened for reading only, and says so."""
+        try:
+            return open_plot(path, **options)
+        except ProjectLockedError as error:
+            session = open_plot(path, **{**options, "read_only": True})
+            session.held_by = error.problem.rstrip(".")
+            what = "It is open here for reading only, as it was saved last; close it there to change it here."
+            session.reopening_notes = (f"{error.problem} {what}", *session.reopening_notes)
+            return session
 
     def project_dir_for(self, path: Path) -> Path:
         """Where a plot made from `path` is saved."""
@@ -471,6 +527,7 @@ class Studio:
         with contextlib.suppress(StudioError):
             self.masks.save()
         if self.session is not None:
+            self._keep_typed()
             self.session.close()
         self.server.stop()
 

@@ -12,6 +12,7 @@ from dbh_studio.app.document import Document
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.arrays import Float32, Float64
 from dbh_studio.core.dbh import CurveFit, DbhEstimate
+from dbh_studio.core.review_queue import review_progress
 from dbh_studio.core.trunks import Trunk
 from dbh_studio.errors import StudioError
 from dbh_studio.settings import Settings
@@ -20,15 +21,18 @@ from dbh_studio.ui.bind import SceneClick, TabWorker
 from dbh_studio.ui.bridge import Bridge
 from dbh_studio.ui.camera_layer import CameraLayer
 from dbh_studio.ui.chain_view import ChainView
+from dbh_studio.ui.edit_desk import EditDesk
+from dbh_studio.ui.edit_keys import add_edit_commands
 from dbh_studio.ui.marking import Marking
 from dbh_studio.ui.mask_paint import MaskTools
 from dbh_studio.ui.panels.base import Panel, set_content
 from dbh_studio.ui.panels.export import ExportPanel
-from dbh_studio.ui.panels.inspect import InspectPanel, row_of
+from dbh_studio.ui.panels.inspect import InspectPanel
 from dbh_studio.ui.panels.open import OpenPanel
 from dbh_studio.ui.panels.scale import ScalePanel
 from dbh_studio.ui.panels.trunks import TrunksPanel
 from dbh_studio.ui.photo_view import PhotoView
+from dbh_studio.ui.returning import Returning
 from dbh_studio.ui.scene import SceneView, TrunkPicture
 from dbh_studio.ui.steps import PlotStatus, StepName
 from dbh_studio.ui.view_controls import ViewControls
@@ -39,9 +43,6 @@ if TYPE_CHECKING:
     from dbh_studio.ui.studio import RunningJob, Studio
 
 log = logging.getLogger(__name__)
-
-# How much of what lies under the cursor must belong to one trunk for the click to mean that trunk.
-_MIN_SHARE = 0.2
 
 
 class Tab:
@@ -57,15 +58,15 @@ class Tab:
         self._build()
         self.bridge.on("step", self._step_chosen)
         self.bridge.on("row", self._row_chosen)
-        self.bridge.on("sort", self._sort_chosen)
         self.bridge.on("undo", lambda _: self._undo_pressed())
         self.bridge.on("redo", lambda _: self._redo_pressed())
         # At once: what fills the queue may be waiting for the very job.
         self.bridge.on("cancel", lambda _: self.studio.cancel_job(), at_once=True)
         self.bridge.on("measure", lambda _: self.studio.measure_missing())
         self.bridge.on("neighbour", lambda n: self._step_tree(1 if n == 1 else -1))
-        worker.on_scene_click(self.client, self._scene_clicked)
+        worker.on_scene_click(self.client, self.click_scene)
         worker.on_close(self.scene.stop)
+        self.returning = Returning(self)
 
     # ---- building
 
@@ -79,9 +80,10 @@ class Tab:
         self.cameras = CameraLayer(self)
         self.marking = Marking(self)
         self.chain = ChainView(self)
-        self.panels: tuple[Panel, ...] = tuple(
-            panel(self) for panel in (OpenPanel, ScalePanel, TrunksPanel, InspectPanel, ExportPanel)
-        )
+        self.editing = EditDesk(self)
+        before = (OpenPanel(self), ScalePanel(self), TrunksPanel(self))
+        self.inspect = InspectPanel(self)
+        self.panels: tuple[Panel, ...] = (*before, self.inspect, ExportPanel(self))
         self.controls = ViewControls(self)
         self._add_commands()
 
@@ -92,13 +94,17 @@ class Tab:
             ("Redo", "Z", "cmd/ctrl+shift", self._redo_pressed),
             ("Next tree", "N", None, lambda: self._step_tree(1)),
             ("Previous tree", "P", None, lambda: self._step_tree(-1)),
+            ("Accept and go on", "space", None, lambda: self.inspect.review.accept()),
+            ("Look again later", "L", None, lambda: self.inspect.review.put_off()),
             ("Fly to the tree", "F", None, self.fly_to_selected),
             ("Next colours", "C", None, self.controls.next_mode),
             ("Look from the top", "T", None, self.scene.look_from_top),
             ("Whole plot", "H", None, self.scene.look_at_plot),
             ("Stop marking", "escape", None, self.marking.stop),
+            ("Stop correcting the measurement", "escape", None, lambda: self.inspect.correction.stop()),
         ):
             self.worker.add_command(label, action, hotkey=key, modifier=modifier)
+        add_edit_commands(self.worker, self.editing)
 
     # ---- the plot
 
@@ -120,7 +126,9 @@ class Tab:
     def adopt_session(self) -> None:
         """Show the plot that is open now from scratch: on connect, and after another one was opened."""
         self.view.selected, self.view.n_inspected = None, 0
+        self.view.several, self.view.review_filter = frozenset(), "all"
         self.photos.close()
+        self.editing.plot_opened()
         self.view.step = self.status().next_step()
         session = self.session
         check = session.data_check if session is not None else None
@@ -142,6 +150,7 @@ class Tab:
             return
         if not self.scene.shows(display):  # after a row of changes the first of them has sent the last one's cloud
             self.scene.show_plot(display)
+            self.editing.plot_sent()
         self.refresh_trunks()
         self.cameras.refresh()
         self.controls.show_plot()
@@ -152,9 +161,12 @@ class Tab:
         session = self.session
         if session is None:
             return
+        self.editing.follow(change)
         # Not those of the change: others may have followed while it waited.
         if self.view.selected not in session.document.trunks:
             self.view.selected = None
+        if not self.view.several <= set(session.document.trunks.ids):
+            self.view.several = frozenset()
         self.refresh()
         self.client.flush()
         if change.moves_points:
@@ -201,6 +213,7 @@ class Tab:
             n_measured=len(measured),
             n_waiting=len(waiting),
             n_inspected=self.view.n_inspected,
+            n_reviewed=review_progress(self.inspect.review.queue()).n_reviewed,
             is_exported=self.studio.is_exported(),
             has_photos=session.cameras is not None,
         )
@@ -211,6 +224,7 @@ class Tab:
         """Bring header, active panel and buttons in step."""
         self.chain.follow()
         with self.client.atomic():
+            self.editing.show()
             self.refresh_header()
             for panel in self.panels:
                 is_active = panel.step == self.view.step
@@ -257,9 +271,11 @@ class Tab:
         document = session.document if session is not None else None
         if session is None or document is None or selected is None or selected not in document.trunks:
             self.scene.highlight(None)
+            self.editing.draw()
             return
         picture = self._picture_of(session, document, document.trunks[selected])
         self.scene.highlight(picture, self._ring_world(self.stem(document, selected)))
+        self.editing.draw()
 
     def stem(self, document: Document, trunk_id: int) -> StemMeasurement | None:
         """A stem of the plot; None while the ground is still being fitted, which may take long."""
@@ -298,23 +314,6 @@ class Tab:
             self.bridge.run(html.job_js(job.fraction, job.message))
         self.client.flush()
 
-    def table_rows(self) -> list[html.TableRow]:
-        """One row per trunk that has been measured."""
-        session = self.session
-        if session is None:
-            return []
-        document = session.document
-        waiting = set(session.unmeasured(document))
-        rows = []
-        for trunk_id in document.trunks.ids:
-            record = document.record(trunk_id)
-            if trunk_id in waiting:
-                rows.append(html.TableRow(trunk_id, None, "", None, "not measured yet"))
-            else:
-                result = session.measurement(trunk_id, document=document).result
-                rows.append(row_of(trunk_id, result, species=record.species, note=record.remark))
-        return rows
-
     # ---- what a person does
 
     def go_to_next_step(self) -> None:
@@ -322,12 +321,18 @@ class Tab:
         self.view.step = self.status().next_step()
         self.refresh()
 
-    def select(self, trunk_id: int | None, *, fly: bool = False) -> None:
-        """Choose a tree: text first, then the row, then the picture. What was typed about the last one is kept."""
-        if trunk_id != self.view.selected:
+    def select(self, trunk_id: int | None, *, fly: bool = False, several: frozenset[int] = frozenset()) -> None:
+        """Choose a tree: text first, then the row, then the picture. What was typed about the last one is kept.
+
+        Args:
+            trunk_id: The tree whose card is shown.
+            fly: Look at it.
+            several: All that are chosen, it among them; empty for it alone.
+        """
+        if (trunk_id, several) != (self.view.selected, self.view.several):
             for panel in self.panels:
                 panel.leave_tree()
-        self.view.selected = trunk_id
+        self.view.selected, self.view.several = trunk_id, several
         if trunk_id is not None:
             self.view.n_inspected += 1
             self.view.step = "inspect"
@@ -337,23 +342,23 @@ class Tab:
         if fly and trunk_id is not None:
             self.fly_to_selected()
 
-    def _scene_clicked(self, click: SceneClick) -> None:
+    def click_scene(self, click: SceneClick) -> None:
+        """Do what a click in the picture does."""
         session, display = self.session, self.studio.display
         if session is None or display is None or self.marking.scene_clicked(click):
             return
-        if not self.marking.is_on and self.chain.clicked(click):
+        if self.inspect.correction.scene_clicked(click):
+            return
+        if not self.marking.is_on and (self.editing.gestures.scene_clicked(click) or self.chain.clicked(click)):
             return
         hit = display.picking.pick(click.ray_origin, click.ray_direction, click.view.pixel_angle_rad)
         if self.cameras.click(click, hit.depth if hit is not None else np.inf) or hit is None:
             return
         if self.marking.is_on:
             return
-        labels = display.trunk_ids(hit.surface, session.document.trunks)
-        ids, counts = np.unique(labels[labels > 0], return_counts=True)
-        if len(ids) and counts.max() >= _MIN_SHARE * len(labels):
-            self.select(int(ids[counts.argmax()]))
-        elif self.view.selected is not None:
-            self.select(None)
+        trunk_id = display.trunk_under(hit, session.document.trunks)
+        if trunk_id is not None or self.view.selected is not None:
+            self.select(trunk_id)
 
     def _step_chosen(self, payload: Any) -> None:
         if payload in get_args(StepName):
@@ -362,17 +367,9 @@ class Tab:
 
     def _row_chosen(self, payload: Any) -> None:
         session = self.session
-        if session is not None and isinstance(payload, int) and payload in session.document.trunks:
+        is_there = session is not None and isinstance(payload, int) and payload in session.document.trunks
+        if is_there and not self.editing.gestures.tree_clicked(payload):
             self.select(payload, fly=True)
-
-    def _sort_chosen(self, payload: Any) -> None:
-        if payload not in [column[0] for column in html.TABLE_COLUMNS]:
-            return
-        if payload == self.view.sort_column:
-            self.view.sort_descending = not self.view.sort_descending
-        else:
-            self.view.sort_column, self.view.sort_descending = payload, False
-        self.refresh()
 
     def _step_tree(self, step: int) -> None:
         ids = self.session.document.trunks.ids if self.session is not None else ()

@@ -45,6 +45,29 @@ class Panel(ABC):
         set_visible(self.folder, visible)
 
 
+class Section(ABC):
+    """A part of a panel, built at the GUI's current place; the panel brings it in step with the plot."""
+
+    def __init__(self, tab: Tab) -> None:
+        self.tab = tab
+        self.gui = tab.client.gui
+        self.build()
+
+    @abstractmethod
+    def build(self) -> None:
+        """Add the section's inputs at the GUI's current place."""
+
+    @abstractmethod
+    def refresh(self) -> None:
+        """Show the plot as it is now; cheap where nothing changed."""
+
+    def set_busy(self, busy: bool) -> None:  # noqa: B027 - most sections start nothing
+        """Lock what cannot be started while a job runs."""
+
+    def leave_tree(self) -> None:  # noqa: B027 - most sections ask nothing about it
+        """Keep what was typed about the chosen tree: another one is about to be chosen."""
+
+
 def set_value(handle: Any, value: Any) -> None:
     """Show a value in an input, where it is not there already: an assignment is a message to the page."""
     if handle.value != value:

@@ -10,7 +10,8 @@ from dbh_studio.io.inventory_csv import inventory_csv
 from dbh_studio.ui import html
 from dbh_studio.ui.evaluation_section import EvaluationSection
 from dbh_studio.ui.export_section import ExportSection
-from dbh_studio.ui.panels.base import Panel, set_content
+from dbh_studio.ui.import_section import ImportSection
+from dbh_studio.ui.panels.base import Panel, set_content, set_visible
 from dbh_studio.ui.transfer_section import TransferSection
 
 
@@ -22,24 +23,31 @@ class ExportPanel(Panel):
     def build(self) -> None:
         """Add the inputs."""
         self._state = self.gui.add_html("")
-        button = self.gui.add_button("Download the inventory (CSV)", icon=viser.Icon.DOWNLOAD, color="green")
-        self.tab.worker.on_click(button, self._export)
+        self._download = self.gui.add_button(
+            "Download the inventory (CSV)", icon=viser.Icon.DOWNLOAD, color="green", visible=False
+        )
+        self.tab.worker.on_click(self._download, self._export)
         self._files = ExportSection(self.tab)
+        self._bring_in = ImportSection(self.tab)
         self._evaluation = EvaluationSection(self.tab)
         self._transfer = TransferSection(self.tab)
 
     def set_busy(self, busy: bool) -> None:
         """One job at a time."""
         self._files.set_busy(busy)
+        self._bring_in.set_busy(busy)
         self._transfer.set_busy(busy)
 
     def refresh(self) -> None:
         """Say what will be in the file."""
         self._files.refresh()
+        self._bring_in.refresh()
         self._evaluation.refresh()
         self._transfer.refresh()
         session = self.tab.session
-        if session is None or not len(session.document.trunks):
+        has_trees = session is not None and len(session.document.trunks) > 0
+        set_visible(self._download, has_trees)
+        if session is None or not has_trees:
             set_content(self._state, html.message("There is nothing to export yet: find the trunks first."))
             return
         document = session.document

@@ -63,7 +63,8 @@ class OpenPanel(Panel):
             set_value(self._path, str(session.document.source.path))
         set_value(self._up, _up_title(session))
         check = session.data_check
-        items = [("note", note, "") for note in session.notes]
+        items = [("warn", note, "") for note in session.reopening_notes]
+        items += [("note", note, "") for note in session.notes]
         verdict = ""
         if check is not None:
             items += [(finding.level, finding.message, finding.remedy) for finding in check.findings]
