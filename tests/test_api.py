@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import io
 import re
 import subprocess
@@ -27,6 +28,7 @@ from dbh_studio.errors import (
 )
 from dbh_studio.io.ply import write_ply
 from dbh_studio.io.project import ProjectWriter
+from dbh_studio.io.undo_log import UndoLog
 
 GUIDE = Path(__file__).parents[1] / "docs" / "guide" / "python.md"
 
@@ -164,8 +166,12 @@ def test_closing_tells_that_the_last_change_could_not_be_saved(folder, tmp_path,
     def full(self, state, **options):
         raise ProjectError("The disk is full.")
 
+    def no_room(self, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
     with monkeypatch.context() as patch:
         patch.setattr(ProjectWriter, "save", full)
+        patch.setattr(UndoLog, "_write", no_room)
         plot.settings("measure", curve="ellipse")
         with pytest.raises(ProjectError, match="disk is full"):
             plot.close()

@@ -29,8 +29,8 @@ from dbh_studio.io.ply import write_ply
 from dbh_studio.io.project import ProjectWriter, read_project
 
 COMMANDS = (
-    "open", "demo", "run", "measure", "scale", "marker", "masks", "models", "transfer", "evaluate", "export", "doctor",
-    "settings",
+    "open", "demo", "run", "measure", "scale", "marker", "masks", "models", "transfer", "evaluate", "export", "import",
+    "doctor", "settings",
 )  # fmt: skip
 DIAMETERS_CM = [100 * diameter for _, _, diameter in STEMS]
 

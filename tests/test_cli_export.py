@@ -109,12 +109,22 @@ def test_nothing_is_overwritten_unasked_and_the_source_never(saved, tmp_path, ca
         (["--circle", 0, 0, 5, "--polygon", "corners.txt"], 2, "either"),
         (["--polygon", "corners.txt"], 1, "corners.txt"),
         (["--class-width", 0], 2, "wider"),
+        (["--class-width", 1e-5], 2, "1,000 are the most"),
         (["--format", "shp"], 2, "shp"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(saved, tmp_path, capsys, arguments, status, said):
     assert said in fails(capsys, saved, "--out", tmp_path / "out", *arguments, status=status)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_is_no_folder_and_thin_stems_are_told(saved, tmp_path, capsys):
+    (tmp_path / "out").write_text("mine")
+    assert "out: This is a file and no folder" in fails(capsys, saved, "--out", tmp_path / "out")
+    succeeds(capsys, saved, "--out", tmp_path / "thin", "--format", "report", "--least-dbh", 90)
+    text = (tmp_path / "thin" / "stand_report.html").read_text("utf-8")
+    assert f"Stems thinner than 90.0 cm are not in this table: {len(STEMS)} of those inside" in text
+    assert f"<dt>Counted</dt><dd>0 of {len(STEMS)} stems" in text
 
 
 def test_a_polygon_comes_from_a_file(saved, tmp_path, capsys):

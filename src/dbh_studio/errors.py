@@ -19,6 +19,7 @@
     ├── StaleResultError            the plot changed while a job ran
     ├── AlignmentError              two clouds cannot be laid on each other
     ├── CommandError                an edit that cannot be applied
+    │   └── MisfitError             some of what is brought in does not fit; the rest would
     └── CancelledError              the person pressed Cancel
 
 Data that cannot be *measured* is not an error: it is a `core.dbh.Refusal`, a value with a reason and a remedy.
@@ -127,6 +128,10 @@ class AlignmentError(StudioError):
 
 class CommandError(StudioError):
     """An edit that cannot be applied to the plot as it is."""
+
+
+class MisfitError(CommandError):
+    """Some stems of a table do not fit the plot; they can be left out."""
 
 
 class CancelledError(StudioError):

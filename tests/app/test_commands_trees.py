@@ -5,8 +5,8 @@ import pytest
 from tests.app.plots import contents, make_cloud, make_document
 
 from dbh_studio.app import commands, edits
-from dbh_studio.app.autosave import document_from_state, state_from_document
 from dbh_studio.app.document import Document
+from dbh_studio.app.saved_states import document_from_state, state_from_document
 from dbh_studio.core.corrections import Correction
 from dbh_studio.core.tree_record import Review, TreeRecord
 from dbh_studio.errors import CommandError

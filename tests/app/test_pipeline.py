@@ -288,7 +288,7 @@ def test_a_saved_plot_opens_as_it_was_left(las, tmp_path):
     for again in ({"path": folder}, {"path": las, "project_dir": folder}):
         reopened = open_plot(**again)
         assert contents(reopened.document) == contents(session.document)
-        assert reopened.saver.status.state == "saved" and not reopened.can_undo
+        assert reopened.saver.status.state == "saved" and reopened.undo_label == "Describe trunk 2"
         reopened.close()
     watched = open_plot(folder, read_only=True)
     with pytest.raises(CommandError):

@@ -19,6 +19,7 @@ from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.stand import PlotArea, stand_table
 from dbh_studio.errors import CancelledError, FileError
 from dbh_studio.io.exports import (
+    geopackage,
     table_of,
     write_dxf,
     write_geojson,
@@ -183,6 +184,8 @@ def test_a_dxf_has_circles_of_the_stems_and_their_numbers(tmp_path):
     feet = write_dxf(tmp_path / "feet.dxf", table_of(stems(2227))).read_text("ascii")  # California zone 3, US feet
     assert f"\n40\n{0.15625 / 0.3048006:.4f}\n" in feet
     assert write_dxf(tmp_path / "utm.dxf", table_of(stems(UTM))).read_text("ascii").count("500004.") >= 1
+    refused = table_of(Inventory.of([row(7, None, 4.0, -2.5, epsg=UTM)]))
+    assert "500004." in write_dxf(tmp_path / "refused.dxf", refused).read_text("ascii")
 
 
 def test_an_svg_shows_every_stem_and_escapes_what_people_type(tmp_path):
@@ -251,6 +254,24 @@ def test_a_source_that_is_another_now_or_the_target_is_refused(las, tmp_path):
     with pytest.raises(CancelledError):
         write_labelled_cloud(tmp_path / "b.laz", cloud, values, source=las, progress=cancel)
     assert las.read_bytes() == content and sorted(p.name for p in tmp_path.iterdir()) == ["a.laz"]
+
+
+@pytest.mark.parametrize("full", [sqlite3.OperationalError("database or disk is full"), OSError(28, "No space left")])
+def test_a_full_disk_beside_the_geopackage_is_told(tmp_path, monkeypatch, full):
+    def fill(*_):
+        raise full
+
+    monkeypatch.setattr(geopackage, "_fill", fill)
+    with pytest.raises(FileError, match=r"stems.gpkg: It could not be written \(.*(full|No space)"):
+        write_geopackage(tmp_path / "stems.gpkg", table_of(stems()))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_workbook_says_which_stems_are_too_thin_for_the_stand(tmp_path):
+    stand = stand_table(stems(), PlotArea.circle((0, 0), 20), least_dbh_cm=20)
+    path = write_xlsx(tmp_path / "a.xlsx", table_of(stems()), stand)
+    columns = pyogrio.raw.read(path, layer="Stand")[3]
+    assert any("thinner than 20.0 cm, which are left out: 1" in str(cell) for column in columns for cell in column)
 
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path):

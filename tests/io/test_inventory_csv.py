@@ -13,12 +13,15 @@ from hypothesis import strategies as st
 
 from dbh_studio.core.inventory import COLUMNS, Inventory, InventoryRow
 from dbh_studio.errors import FileError
+from dbh_studio.io.column_names import own_columns, own_field
 from dbh_studio.io.inventory_csv import (
     check_absent,
     check_not_source,
     check_replaceable,
+    defused,
     inventory_csv,
     projected_epsg,
+    undefused,
     write_inventory_csv,
 )
 
@@ -43,7 +46,12 @@ MEASURED = InventoryRow(
     dbh_area_cm=31.3,
     dbh_area_lo_cm=30.1,
     dbh_area_hi_cm=32.5,
+    tree_dbh_cm=31.41593,
     hom_m=1.37,
+    breast_height_m=1.3,
+    base="midpoint",
+    along="vertical",
+    above="nothing",
     coverage_deg=300.04,
     max_gap_deg=59.96,
     rmse_mm=4.25,
@@ -92,6 +100,7 @@ REFUSED = replace(
     dbh_area_hi_cm=None,
     dbh_method="",
     dbh_definition="",
+    tree_dbh_cm=None,
     hom_m=None,
     coverage_deg=None,
     max_gap_deg=None,
@@ -123,13 +132,17 @@ REFUSED = replace(
 GOLDEN = (
     "plot_id,tree_id,stem_id,tag,status,species,dbh_cm,dbh_lo_cm,dbh_hi_cm,dbh_method,dbh_definition,"
     "dbh_tape_cm,dbh_tape_lo_cm,dbh_tape_hi_cm,dbh_curve_cm,dbh_curve_lo_cm,dbh_curve_hi_cm,"
-    "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,hom_m,coverage_deg,max_gap_deg,rmse_mm,"
+    "dbh_area_cm,dbh_area_lo_cm,dbh_area_hi_cm,tree_dbh_cm,hom_m,breast_height_m,base,along,above,"
+    "coverage_deg,max_gap_deg,rmse_mm,"
     "n_points,lean_deg,taper_cm_per_m,quality,flags,reason,remedy,edited,x_m,y_m,z_ground_m,scale_source,scale_err_pct,"
     "note,health,crown_class,field_tape_cm,field_tape_height_m,corrections,review,easting,northing,epsg\n"
     "Stand 4,1,1,A-7,live,Fagus sylvatica,31.42,30.20,32.65,shrinkage,curve,31.70,30.50,32.96,31.42,30.20,32.65,"
-    "31.30,30.10,32.50,1.370,300.0,60.0,4.2,812,3.1,1.23,good,,,,false,1.500,-2.250,"
-    '0.000,marker,0.150,"low fork, ""twin""",thin crown,dominant,31.90,1.300,curve;ground,accepted,500001.500,4499997.750,32633\n'
-    "Stand 4,2,2,'=HYPERLINK(1),,Weißtanne,,,,,,,,,,,,,,,,,,,4,,,refused,too_few_points,Only 4 points at 1.3 m.,"
+    "31.30,30.10,32.50,31.42,1.370,1.300,midpoint,vertical,nothing,300.0,60.0,4.2,812,3.1,1.23,good,,,,false,"
+    "1.500,-2.250,"
+    '0.000,marker,0.150,"low fork, ""twin""",thin crown,dominant,31.90,1.300,curve;ground,accepted,500001.500,'
+    "4499997.750,32633\n"
+    "Stand 4,2,2,'=HYPERLINK(1),,Weißtanne,,,,,,,,,,,,,,,,,1.300,midpoint,vertical,nothing,,,,4,,,refused,"
+    "too_few_points,Only 4 points at 1.3 m.,"
     "Walk closer.,true,,,,marker,,,,,,,,,,,\n"
 ).encode()
 
@@ -247,3 +260,29 @@ def test_which_reference_systems_are_maps():
     assert projected_epsg("EPSG:4326") == (False, 4326)
     for unknown in (None, "", "here and there", "EPSG:999999"):
         assert projected_epsg(unknown) == (False, None)
+
+
+@given(st.text(st.characters(codec="utf-8") | st.sampled_from("=+-@'\";|\t\n"), max_size=30))
+def test_what_was_defused_can_be_had_back(text):
+    plain = text.replace("\x00", "").replace("\r\n", "\n").replace("\r", "\n")
+    assert undefused(defused(text)) == plain
+    assert not defused(text).startswith(("=", "+", "-", "@", "\t", "\n"))
+
+
+def test_fields_of_ones_own_are_columns_behind_ours():
+    inventory = Inventory.of([MEASURED, REFUSED], {MEASURED.stem_id: (("=cut", "+1"), ("Species", "mine"))})
+    content = inventory_csv(inventory).decode()
+    header, *rows = list(csv.reader(io.StringIO(content, newline="")))
+    assert header == [*COLUMNS, "'=cut", "Species_own"]
+    assert sorted(row[-2:] for row in rows) == [["", ""], ["'+1", "mine"]]
+
+
+def test_columns_of_ones_own_are_told_apart_in_every_format():
+    names = ["DBH_cm", "dbh_in", "fid", "Geom", "x\x07y", "xy", "", "A" * 300, "a" * 300, "dbh_cm_own", "bark"]
+    columns = list(own_columns(names).values())
+    folded = [name.casefold() for name in columns]
+    assert len(set(folded)) == len(names) and not {*folded} & {*COLUMNS, "fid", "geom", "dbh_in"}
+    assert columns[-1] == "bark" and all(0 < len(name) <= 70 and name.isprintable() for name in columns)
+    for name in ("DBH_cm", "fid", "bark"):
+        assert own_field(own_columns([name])[name]) == name
+    assert own_field("mine_own") == "mine_own"

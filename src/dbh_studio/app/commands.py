@@ -277,7 +277,7 @@ def describe_trees(ids: Iterable[int], **values: Any) -> Command:
     return Command(f"Describe {names}", apply)
 
 
-def set_tree_fields(ids: Iterable[int], **values: str) -> Command:
+def set_tree_fields(ids: Iterable[int], /, **values: str) -> Command:
     """Fill fields of one's own, by name, of several stems; an empty text clears the field, others stay."""
     wanted = sorted(set(ids))
 

@@ -105,7 +105,8 @@ def evaluate_plot(session: Session, request: EvaluationRequest) -> Comparison:
         StudioError: They cannot be paired.
     """
     document = session.document
-    content = inventory_csv(session.inventory(document=document))
+    # Without fields of one's own: they may be called as anything that is looked for in a table.
+    content = inventory_csv(replace(session.inventory(document=document), own=()))
     table = stem_table_of(content, request.inventory_reading, name=document.plot_id or "this plot")
     return _compared([table], request)
 
@@ -281,6 +282,7 @@ def section_pictures(session: Session, comparison: Comparison) -> tuple[SectionP
         session: The plot the first inventory was measured in.
         comparison: Its evaluation.
     """
+    from dbh_studio.app.derived import stem_setup_of
     from dbh_studio.core.measured import CurveFit, DbhEstimate
     from dbh_studio.stages.measure import measure_trunk
 
@@ -291,12 +293,14 @@ def section_pictures(session: Session, comparison: Comparison) -> tuple[SectionP
     known = [s for s in known if trunk_ids[s.stem] in document.trunks]
     pictures = []
     for word, sample in _spread(sorted(known, key=lambda s: abs(s.error_pct or 0.0))):
+        setup = stem_setup_of(document, trunk_ids[sample.stem])
         result = measure_trunk(
-            session.points_world(document)[document.trunks[trunk_ids[sample.stem]].points],
+            setup.measured(session.points_world(document)[document.trunks[trunk_ids[sample.stem]].points]),
             trunk_id=trunk_ids[sample.stem],
             ground=session.ground(document=document),
-            settings=document.settings.measure,
+            settings=setup.settings,
             curves=_PAPERS_CURVES,
+            **setup.placed,
         ).result
         if not isinstance(result, DbhEstimate) or sample.reference_cm is None:
             continue

@@ -1,34 +1,56 @@
-"""A plot handed in: inventory, stem map, stand table and cloud, all of one state of the plot, under one name."""
+"""A plot handed in: inventory, maps, report, log and cloud, all of one state of the plot, under one name."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
+from dbh_studio.app.autosave import Autosave
 from dbh_studio.app.document import Document
 from dbh_studio.app.names import file_name
+from dbh_studio.app.plot_areas import AreaFrame, area_from_text, placed_area, plot_area
+from dbh_studio.app.report import PictureSize, ReportParts, make_report, north_of, protocol_words, scale_words
 from dbh_studio.app.session import Session
-from dbh_studio.core.arrays import Float32, Float64, Int32
+from dbh_studio.core.arrays import Float32, Int32
 from dbh_studio.core.progress import Progress, ignore_progress, subprogress
-from dbh_studio.core.stand import PlotArea, StandTable, Units, stand_table
+from dbh_studio.core.stand import ACRE_M2, PlotArea, StandTable, Units, stand_table
 from dbh_studio.errors import FileError, SettingError
 from dbh_studio.io.inventory_csv import check_not_source
 
 if TYPE_CHECKING:
     from dbh_studio.core.ground import GroundModel
     from dbh_studio.core.inventory import Inventory
+    from dbh_studio.io.exports.edit_log import LogEntry
+    from dbh_studio.io.exports.report_model import Report
 
-Format = Literal["csv", "gpkg", "geojson", "xlsx", "svg", "dxf", "laz", "las"]
+__all__ = [
+    "FORMATS",
+    "TITLES",
+    "ExportRequest",
+    "Format",
+    "area_from_text",
+    "edit_log",
+    "export_plot",
+    "heights_above",
+    "labels_and_heights",
+    "plot_area",
+]
+
+Format = Literal["csv", "gpkg", "geojson", "xlsx", "report", "pdf", "3d", "edits", "svg", "dxf", "laz", "las"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 TITLES: dict[Format, str] = {
     "csv": "inventory, one row per stem",
     "gpkg": "GeoPackage: a layer of stems for QGIS and other map programs",
     "geojson": "stems with longitude and latitude",
-    "xlsx": "Excel workbook: stems, stand table, how it was measured",
+    "xlsx": "Excel workbook: stems, stand table, edits, how it was measured",
+    "report": "report to read and print, one HTML file",
+    "pdf": "the report as PDF, printed by a Chromium or Chrome of this computer",
+    "3d": "the plot to look at in 3D, one HTML file",
+    "edits": "who changed what and when, as CSV",
     "svg": "stem map to look at and print",
     "dxf": "stem map for CAD",
     "laz": "the cloud, compressed, with tree_id and height above ground",
@@ -44,18 +66,22 @@ class ExportRequest:
 
     Attributes:
         formats: In which files.
-        units: Of diameters and heights in tables; the CSV is always metric, so that it can be read back.
-        area: The plot, for the stand table and the maps; None takes the rectangle around the cloud's ground.
+        units: Of diameters and heights in tables and pages; the CSV is always metric, so that it can be read back.
+        area: The plot, for the stand table and the maps; None takes the rectangle around the cloud, see `plot_area`.
+        area_frame: What `area` was given in, see `plot_areas.placed_area`.
         class_width: Of the stand table's diameter classes, cm or inches; None takes 5 cm or 2 inches.
         least_dbh_cm: Thinner stems are no part of the stand table.
+        pictures: Photographs in the report; ``small`` ones leave it small enough to be mailed.
         overwrite: Replace files of these names.
     """
 
     formats: tuple[Format, ...]
     units: Units = "metric"
     area: PlotArea | None = None
+    area_frame: AreaFrame = "auto"
     class_width: float | None = None
     least_dbh_cm: float = 0.0
+    pictures: PictureSize = "small"
     overwrite: bool = False
 
 
@@ -76,7 +102,7 @@ def export_plot(
 
     Raises:
         UnscaledCloudError: The scale is not known.
-        SettingError: Nothing, or an unknown format, is asked for.
+        SettingError: Nothing, or an unknown format, is asked for, or the plot's area makes no sense.
         FileError: A file is there already, is what the plot is read from, or cannot be written.
         MissingComponentError: A package for a format is absent; the formats before it are written.
     """
@@ -88,6 +114,8 @@ def export_plot(
     document = session.document
     session.require_scale(document)
     stem = file_name(name or document.plot_id)
+    if out_dir.exists() and not out_dir.is_dir():
+        raise FileError(out_dir, "This is a file and no folder.", "Name a folder; it is made where it is not there.")
     paths = {each: out_dir / f"{stem}{_ENDINGS.get(each, f'.{each}')}" for each in wanted}
     for path in paths.values():
         check_not_source(path, document.source.used)
@@ -96,8 +124,11 @@ def export_plot(
                 path, "There is such a file already.", "Choose another folder, or say that it may be replaced."
             )
     share = 0.5 / len(wanted)
+    area = placed_area(session, document, request.area, request.area_frame)
     inventory = session.inventory(subprogress(progress, 0.0, 0.5), document=document)
-    writer = _Writer(session, document, request, inventory)
+    writer = _Writer(session, document, request, inventory, area)
+    if not _WITH_STAND.isdisjoint(wanted):
+        _ = writer.stand  # What makes no sense is said before anything is written.
     for number, (each, path) in enumerate(paths.items()):
         progress(0.5 + share * number, f"Writing {path.name}")
         writer.write(each, path, subprogress(progress, 0.5 + share * number, 0.5 + share * (number + 1)))
@@ -105,22 +136,37 @@ def export_plot(
     return tuple(paths.values())
 
 
-_ENDINGS = {"csv": "_inventory.csv", "svg": "_map.svg", "dxf": "_map.dxf", "laz": "_trees.laz", "las": "_trees.las"}
+_WITH_STAND = frozenset({"xlsx", "report", "pdf"})
+_ENDINGS = {
+    "csv": "_inventory.csv",
+    "report": "_report.html",
+    "pdf": "_report.pdf",
+    "3d": "_3d.html",
+    "edits": "_edits.csv",
+    "svg": "_map.svg",
+    "dxf": "_map.dxf",
+    "laz": "_trees.laz",
+    "las": "_trees.las",
+}
 
 
-def plot_area(session: Session, document: Document) -> PlotArea:
-    """The rectangle, along x and y, in which 98 % of the cloud's points are: stray points are no plot.
+def edit_log(session: Session, document: Document, units: Units = "metric") -> tuple[LogEntry, ...]:
+    """What was done to the plot, where it is saved, and the corrections and reviews that stand.
 
     Raises:
-        SettingError: The cloud has no extent.
+        ProjectError: The history cannot be read.
     """
-    points = session.points_world(document)
-    sample = points[:: max(1, len(points) // 500_000), :2].astype(np.float64)
-    sample = sample[np.isfinite(sample).all(axis=1)]
-    try:
-        return PlotArea.extent(np.quantile(sample, [0.01, 0.99], axis=0)) if len(sample) else PlotArea.extent(sample)
-    except ValueError as error:
-        raise SettingError(f"The plot has no area: {error}.", "Say it, as a circle or a polygon.") from None
+    from dbh_studio.io.exports.edit_log import decisions, history_entries
+    from dbh_studio.io.exports.pages import Words
+    from dbh_studio.io.history import read_history
+
+    saver = session.saver
+    if isinstance(saver, Autosave):
+        # What was done a moment ago may not be on disk yet; where it cannot be saved, the studio says so elsewhere.
+        saver.flush()
+    folder = saver.folder if isinstance(saver, Autosave) else session.read_from
+    history = read_history(folder) if folder is not None else []
+    return (*history_entries(history), *decisions(document.trees, Words(units)))
 
 
 def labels_and_heights(session: Session, document: Document) -> tuple[Int32, Float32]:
@@ -142,11 +188,15 @@ def heights_above(points_world: Float32, ground: GroundModel) -> Float32:
 class _Writer:
     """One state of a plot, on its way into files."""
 
-    def __init__(self, session: Session, document: Document, request: ExportRequest, inventory: Inventory) -> None:
+    def __init__(
+        self, session: Session, document: Document, request: ExportRequest, inventory: Inventory, area: PlotArea
+    ) -> None:
         from dbh_studio.io.exports import table_of
 
         self.session, self.document, self.request, self.inventory = session, document, request, inventory
+        self.area = area
         self.table = table_of(inventory, request.units)
+        self._report: Report | None = None
 
     def write(self, kind: Format, path: Path, progress: Progress) -> None:
         """Write one file."""
@@ -160,87 +210,76 @@ class _Writer:
         elif kind == "geojson":
             exports.write_geojson(path, self.table)
         elif kind == "xlsx":
-            exports.write_xlsx(path, self.table, self._stand(), about=self._about())
+            exports.write_xlsx(path, self.table, self.stand, about=self._about(), log=self.log)
         elif kind == "svg":
-            exports.write_svg(path, self.table, area=self._area())
+            exports.write_svg(path, self.table, area=self.area, north=north_of(self.session, self.document))
         elif kind == "dxf":
-            exports.write_dxf(path, self.table, area=self._area())
+            exports.write_dxf(path, self.table, area=self.area)
+        elif kind == "edits":
+            exports.write_edits_csv(path, self.log)
+        elif kind in ("report", "pdf"):
+            self._write_report(kind, path, progress)
+        elif kind == "3d":
+            from dbh_studio.app.scene_page import make_scene
+
+            exports.write_scene_html(path, make_scene(self.session, self.document, self.table))
         else:
-            tree_id, height = labels_and_heights(self.session, self.document)
-            used = self.document.source.used
-            values = {"tree_id": tree_id, "height_above_ground": height}
-            source = used[0] if len(used) == 1 else None
-            exports.write_labelled_cloud(path, self.session.cloud, values, source=source, progress=progress)
+            self._write_cloud(path, progress)
 
-    def _area(self) -> PlotArea:
-        return self.request.area or plot_area(self.session, self.document)
+    def _write_report(self, kind: Format, path: Path, progress: Progress) -> None:
+        from dbh_studio.io import exports
 
-    def _stand(self) -> StandTable:
+        if self._report is None:
+            parts = ReportParts(self.table, self.stand, self.area, self.log)
+            size = self.request.pictures
+            self._report = make_report(self.session, self.document, parts, pictures=size, progress=progress)
+        if kind == "report":
+            exports.write_report_html(path, self._report)
+        else:
+            from dbh_studio.app.report_pdf import write_report_pdf
+
+            write_report_pdf(path, exports.report_html(self._report))
+
+    def _write_cloud(self, path: Path, progress: Progress) -> None:
+        from dbh_studio.io import exports
+
+        tree_id, height = labels_and_heights(self.session, self.document)
+        used = self.document.source.used
+        values = {"tree_id": tree_id, "height_above_ground": height}
+        source = used[0] if len(used) == 1 else None
+        exports.write_labelled_cloud(path, self.session.cloud, values, source=source, progress=progress)
+
+    @cached_property
+    def log(self) -> tuple[LogEntry, ...]:
+        """What was done to the plot."""
+        return edit_log(self.session, self.document, self.request.units)
+
+    @cached_property
+    def stand(self) -> StandTable:
+        """The stand table."""
         request = self.request
-        return stand_table(
-            self.inventory,
-            self._area(),
-            units=request.units,
-            class_width=request.class_width,
-            least_dbh_cm=request.least_dbh_cm,
-        )
+        try:
+            return stand_table(
+                self.inventory,
+                self.area,
+                units=request.units,
+                class_width=request.class_width,
+                least_dbh_cm=request.least_dbh_cm,
+            )
+        except ValueError as error:
+            raise SettingError(f"There is no such stand table: {error}.", "Choose wider diameter classes.") from None
 
     def _about(self) -> dict[str, str]:
-        document = self.document
-        area, scale = self._area(), document.scale
-        error = scale.standard_error
+        document, area = self.document, self.area
+        acres = f" = {area.area_m2 / ACRE_M2:.4f} acre" if self.request.units == "imperial" else ""
         return {
             "Plot": document.plot_id,
             "Cloud": document.source.path.name,
             "Points": f"{document.source.n_points:,}",
             "Breast height": f"{document.settings.measure.breast_height_m:.2f} m",
+            "Protocol": protocol_words(document, self.request.units),
             "Curve": document.settings.measure.curve,
-            "Scale": f"{scale.metres_per_unit:.6g} m per unit ({scale.source})"
-            + (f", standard error {100 * error / scale.metres_per_unit:.2f} %" if error is not None else ""),
-            "Plot area": f"{area.area_m2:,.1f} m² ({area.kind})",
+            "Scale": scale_words(document),
+            "Plot area": f"{area.area_m2:,.1f} m² ({area.kind}){acres}",
             "Stems without a diameter": f"{self.inventory.n_refused} of {len(self.inventory)}; each row says why",
         }
-
-
-def area_from_text(circle: Sequence[float] | None, polygon: Path | None) -> PlotArea | None:
-    """The plot as a person gives it: x, y and radius of a circle, or a file with a corner per line.
-
-    Raises:
-        SettingError: It is no plot.
-        FileError: The file cannot be read or holds something else.
-    """
-    if circle is not None and polygon is not None:
-        raise SettingError("The plot is either a circle or a polygon.", "Leave one of them away.")
-    try:
-        if circle is not None:
-            return PlotArea.circle(circle[:2], circle[2])
-        if polygon is not None:
-            return PlotArea.polygon(_corners(polygon))
-    except ValueError as error:
-        raise SettingError(f"The plot cannot be this: {error}.") from None
-    return None
-
-
-def _corners(path: Path) -> Float64:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(path, f"The corners cannot be read ({error}).") from None
-    corners = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        # Where semicolons divide, a comma is the decimal sign.
-        divided = line.replace(",", ".").replace(";", " ") if ";" in line else line.replace(",", " ")
-        parts = divided.split()
-        if not parts or parts[0].startswith("#"):
-            continue
-        try:
-            corners.append([float(part) for part in parts[:2]])
-            if len(parts) < 2:
-                raise ValueError
-        except ValueError:
-            if not corners and number == 1:
-                continue  # a line of headings
-            raise FileError(
-                path, f"Line {number} is no corner: {line[:40]!r}.", "Give x and y in metres, a corner per line."
-            ) from None
-    return np.array(corners, np.float64).reshape(-1, 2)

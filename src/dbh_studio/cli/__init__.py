@@ -146,7 +146,20 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line."""
-    from dbh_studio.cli import doctor, evaluate, export, marker, masks, measure, models, run, scale, studio, transfer
+    from dbh_studio.cli import (
+        doctor,
+        evaluate,
+        export,
+        inventory_import,
+        marker,
+        masks,
+        measure,
+        models,
+        run,
+        scale,
+        studio,
+        transfer,
+    )
 
     parser = argparse.ArgumentParser(
         prog="dbh-studio",
@@ -156,7 +169,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"dbh-studio {__version__}")
     parser.add_argument("--verbose", action="store_true", help="log what is done to standard error")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for module in (studio, run, measure, scale, evaluate, export, marker, masks, models, transfer, doctor):
+    parts = (studio, run, measure, scale, evaluate, export, inventory_import, marker, masks, models, transfer, doctor)
+    for module in parts:
         module.add_commands(commands)
     for command in commands.choices.values():
         # Also behind the command; without a default, which would undo the one in front of it.

@@ -9,14 +9,14 @@ from typing import Any
 
 from dbh_studio.cli.common import add_relocation_option, finite_number, path_argument, plain, progress_for
 
-_FORMATS = ("csv", "gpkg", "geojson", "xlsx", "svg", "dxf", "laz", "las")
+_FORMATS = ("csv", "gpkg", "geojson", "xlsx", "report", "pdf", "3d", "edits", "svg", "dxf", "laz", "las")
 
 
 def add_commands(commands: Any) -> None:
     """Register the command."""
     export = commands.add_parser(
         "export",
-        help="write inventory, stem map, stand table and labelled cloud of a saved plot",
+        help="write inventory, report, maps, stand table and labelled cloud of a saved plot",
         description="Write a saved plot (NAME.dbh) in the formats it is handed in. All of them are made of one table: "
         "the same ids and numbers everywhere, an empty cell for what is not known.",
     )
@@ -39,11 +39,36 @@ def add_commands(commands: Any) -> None:
         "--circle", type=finite_number, nargs=3, metavar=("X", "Y", "RADIUS"), help="a circular plot, metres"
     )
     area.add_argument("--polygon", type=path_argument, metavar="FILE", help="a text file with a corner per line: x, y")
+    frame = area.add_mutually_exclusive_group()
+    frame.add_argument(
+        "--map",
+        action="store_const",
+        const="map",
+        dest="area_frame",
+        default="auto",
+        help="circle or polygon are easting and northing of the cloud's map system; the radius stays in metres. By "
+        "default they are taken for that where they lie off the cloud in the plot's own metres, and so lie on it",
+    )
+    frame.add_argument(
+        "--plot-metres",
+        action="store_const",
+        const="plot",
+        dest="area_frame",
+        default="auto",
+        help="circle or polygon are in the plot's own metres, as the stem map has them",
+    )
     area.add_argument(
         "--least-dbh", type=finite_number, default=0.0, metavar="CM", help="thinner stems are not in the stand table"
     )
     area.add_argument(
         "--class-width", type=finite_number, metavar="WIDTH", help="of diameter classes; 5 cm or 2 inches by default"
+    )
+    export.add_argument(
+        "--photos",
+        choices=("none", "small", "large"),
+        default="small",
+        help="photographs of the trees in the report, where the plot has photos; small ones leave it small enough to "
+        "be mailed",
     )
     export.add_argument("--overwrite", action="store_true", help="replace files of these names")
     add_relocation_option(export)
@@ -69,8 +94,10 @@ def export_saved(options: argparse.Namespace) -> int:
         formats=tuple(options.formats) or ("csv", "gpkg", "xlsx"),
         units="imperial" if options.imperial else "metric",
         area=area_from_text(options.circle, options.polygon),
+        area_frame=options.area_frame,
         class_width=options.class_width,
         least_dbh_cm=options.least_dbh,
+        pictures=options.photos,
         overwrite=options.overwrite,
     )
     with progress_for(options) as progress:

@@ -16,10 +16,12 @@ from typing import Any
 from dbh_studio.core.inventory import COLUMNS, Inventory, InventoryRow
 from dbh_studio.errors import FileError
 from dbh_studio.io.atomic import atomic_file
+from dbh_studio.io.column_names import own_columns
 
 # Decimals by column: a tape reads millimetres, a scanner no finer than that.
 _DECIMALS = {
     **{column: 2 for column in COLUMNS if column.startswith("dbh_") and column.endswith("_cm")},
+    "tree_dbh_cm": 2,
     "taper_cm_per_m": 2,
     "hom_m": 3,
     "coverage_deg": 1,
@@ -43,7 +45,10 @@ _LAST_COLUMN = "epsg"
 # OWASP, "CSV injection": these start a formula in Excel, LibreOffice and Google Sheets, at the start of a cell. Where
 # the decimal sign is a comma, a spreadsheet divides at semicolons and takes the quotes around our cell for letters:
 # there a cell also starts behind a semicolon, a tab or a line feed, and its own quotes are opened by one in the text.
-_FORMULA_START = re.compile(r"\A(?=[=+\-@\t\n＝＋－＠])|(?<=[;\t\n|])(?=\"*[=+\-@＝＋－＠])")
+# Apostrophes that stand there count too, so that ours can be told from theirs and taken away again.
+_SIGNS = r"=+\-@＝＋－＠"
+_FORMULA_START = re.compile(rf"\A(?='*[{_SIGNS}\t\n])|(?<=[;\t\n|])(?=[\"']*[{_SIGNS}])")
+_DEFUSED_START = re.compile(rf"\A'(?='*[{_SIGNS}\t\n])|(?<=[;\t\n|])'(?=[\"']*[{_SIGNS}])")
 
 
 def _cell(column: str, value: Any) -> str:
@@ -54,7 +59,7 @@ def _cell(column: str, value: Any) -> str:
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):
-        text = f"{value:.{_DECIMALS[column]}f}"
+        text = f"{value:.{_DECIMALS.get(column, 3)}f}"
         # -0.000 is a zero that looks like a mistake.
         return text.removeprefix("-") if float(text) == 0 else text
     return defused(str(value))
@@ -65,6 +70,11 @@ def defused(text: str) -> str:
     # A NUL ends the text for many readers; a lone carriage return is a line end to some and is not quoted by csv.
     text = text.replace("\x00", "").replace("\r\n", "\n").replace("\r", "\n")
     return _FORMULA_START.sub("'", text)
+
+
+def undefused(text: str) -> str:
+    """What `defused` was given."""
+    return _DEFUSED_START.sub("", text)
 
 
 def _cells(row: InventoryRow) -> list[str]:
@@ -79,8 +89,12 @@ def inventory_csv(inventory: Inventory, *, bom: bool = False) -> bytes:
     """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(_cells(row) for row in inventory)
+    own = own_columns(inventory.own_names)
+    said = {stem_id: dict(pairs) for stem_id, pairs in inventory.own}
+    writer.writerow([*COLUMNS, *map(defused, own.values())])
+    for row in inventory:
+        values = said.get(row.stem_id, {})
+        writer.writerow([*_cells(row), *(defused(values.get(name, "")) for name in own)])
     return text.getvalue().encode("utf-8-sig" if bom else "utf-8", errors="replace")
 
 

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import IO, Any, Literal
 
 from dbh_studio.core.inventory import Inventory, InventoryRow
-from dbh_studio.core.stand import CM_PER_INCH, Units
+from dbh_studio.core.markup import without_controls
+from dbh_studio.core.stand import Units
 from dbh_studio.errors import FileError
 from dbh_studio.io.atomic import atomic_file
+from dbh_studio.io.column_names import in_units, own_columns
 
 Kind = Literal["text", "integer", "real", "boolean"]
 
-_M_PER_FOOT = 0.3048
-# Coordinates stay in the unit of their frame: a map position in feet would be another place.
-_PLACES = frozenset({"x_m", "y_m", "z_ground_m"})
-_IMPERIAL = (
-    ("_cm_per_m", "_in_per_ft", _M_PER_FOOT / CM_PER_INCH),
-    ("_cm", "_in", 1 / CM_PER_INCH),
-    ("_m", "_ft", 1 / _M_PER_FOOT),
-)
 _KINDS: dict[str, Kind] = {"str": "text", "int": "integer", "float": "real", "bool": "boolean"}
 
 
@@ -62,25 +56,32 @@ class Table:
 
 
 def table_of(inventory: Inventory, units: Units = "metric") -> Table:
-    """The table of an inventory; with ``imperial`` diameters are inches and heights feet, under names that say so."""
+    """The table of an inventory; with ``imperial`` diameters are inches and heights feet, under names that say so.
+
+    Fields the person has added stand behind our columns.
+    """
     columns, readers = [], []
     for each in fields(InventoryRow):
-        name, convert = _in_units(each.name, units)
+        name, convert = in_units(each.name, units)
         kind = _KINDS[str(each.type).removesuffix(" | None")]
         columns.append(Column(name, kind))
         readers.append((each.name, convert))
-    rows = tuple(tuple(convert(getattr(row, name)) for name, convert in readers) for row in inventory)
+    own = own_columns(inventory.own_names)
+    columns += [Column(name, "text") for name in own.values()]
+    said = {stem_id: dict(pairs) for stem_id, pairs in inventory.own}
+    rows = tuple(
+        (
+            *(_clean(convert(getattr(row, name))) for name, convert in readers),
+            *(_clean(said.get(row.stem_id, {}).get(name, "")) for name in own),
+        )
+        for row in inventory
+    )
     return Table(tuple(columns), rows, inventory, units)
 
 
-def _in_units(name: str, units: Units) -> tuple[str, Callable[[Any], Any]]:
-    """The name a column has in these units, and what turns its cells."""
-    if units == "metric" or name in _PLACES:
-        return name, lambda value: value
-    for suffix, other, factor in _IMPERIAL:
-        if name.endswith(suffix):
-            return name.removesuffix(suffix) + other, lambda value, by=factor: None if value is None else value * by
-    return name, lambda value: value
+def _clean(cell: Any) -> Any:
+    """Text as every format can hold it: XML forbids control characters, and SQLite's readers stop at a NUL."""
+    return without_controls(cell) if isinstance(cell, str) else cell
 
 
 @contextmanager

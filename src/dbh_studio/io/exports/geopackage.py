@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from dbh_studio.io.exports.columns import Kind, Table, written_whole
+from dbh_studio.io.exports.columns import Kind, Table, unwritten, written_whole
 
 LAYER = "stems"
 
@@ -39,6 +39,19 @@ def write_geopackage(path: Path | str, table: Table) -> Path:
         FileError: It cannot be written.
     """
     path = Path(path)
+    try:
+        content = _content(table)
+    except OSError as error:
+        raise unwritten(path, error) from error
+    except sqlite3.OperationalError as error:
+        raise unwritten(path, OSError(str(error))) from error
+    with written_whole(path) as file:
+        file.write(content)
+    return path
+
+
+def _content(table: Table) -> bytes:
+    """The whole file. Raises OSError and sqlite3.OperationalError where there is no room for it."""
     with tempfile.TemporaryDirectory() as folder:
         # SQLite wants a file of its own, with its journal beside; what is handed in appears whole or not at all.
         made = Path(folder) / "stems.gpkg"
@@ -48,10 +61,7 @@ def write_geopackage(path: Path | str, table: Table) -> Path:
                 _fill(connection, table)
         finally:
             connection.close()
-        content = made.read_bytes()
-    with written_whole(path) as file:
-        file.write(content)
-    return path
+        return made.read_bytes()
 
 
 def _fill(connection: sqlite3.Connection, table: Table) -> None:
@@ -60,7 +70,7 @@ def _fill(connection: sqlite3.Connection, table: Table) -> None:
     for statement in _SCHEMA.split(";"):
         connection.execute(statement)
     srs_id = _reference_systems(connection, table)
-    columns = ", ".join(f'"{column.name}" {_TYPES[column.kind]}' for column in table.columns)
+    columns = ", ".join(f"{_quoted(column.name)} {_TYPES[column.kind]}" for column in table.columns)
     connection.execute(f'CREATE TABLE "{LAYER}" (fid INTEGER PRIMARY KEY AUTOINCREMENT, geom POINT, {columns})')
     places = [_place(row, srs_id) for row in table.inventory]
     known = [place for place in places if place is not None]
@@ -73,9 +83,14 @@ def _fill(connection: sqlite3.Connection, table: Table) -> None:
     )
     connection.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', 'POINT', ?, 0, 0)", (LAYER, srs_id))
     marks = ", ".join("?" * (len(table.columns) + 1))
-    names = ", ".join(f'"{column.name}"' for column in table.columns)
+    names = ", ".join(_quoted(column.name) for column in table.columns)
     rows = [(_point(place, srs_id), *row) for place, row in zip(places, table.rows, strict=True)]
     connection.executemany(f'INSERT INTO "{LAYER}" (geom, {names}) VALUES ({marks})', rows)
+
+
+def _quoted(name: str) -> str:
+    """A name in SQL: people call their fields what they like."""
+    return '"' + name.replace('"', '""') + '"'
 
 
 def _reference_systems(connection: sqlite3.Connection, table: Table) -> int:

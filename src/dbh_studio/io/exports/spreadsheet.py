@@ -1,24 +1,35 @@
-"""The inventory as an Excel workbook: the stems, the stand table, and what the columns mean."""
+"""The inventory as an Excel workbook: the stems, the stand table, the edits, and how it was measured."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from dbh_studio.core.markup import without_controls
 from dbh_studio.core.stand import StandTable
 from dbh_studio.errors import MissingComponentError
 from dbh_studio.io.exports.columns import Table, written_whole
+from dbh_studio.io.exports.edit_log import EDIT_COLUMNS, LogEntry, cells
+from dbh_studio.io.exports.pages import Words
 
 _WIDEST = 60
+_EDIT_WIDTHS = (26, 14, 44, 11, 9, 32, 44)
+# What Excel takes: XlsxWriter leaves out a text that is longer.
+_LONGEST_CELL, _MOST_ROWS = 32_767, 1_000_000
 _FORMATS = {"_cm": "0.00", "_in": "0.00", "_m": "0.000", "_ft": "0.00", "_deg": "0.0", "_mm": "0.0", "_pct": "0.00"}
 
 
 def write_xlsx(
-    path: Path | str, table: Table, stand: StandTable | None = None, *, about: Mapping[str, str] | None = None
+    path: Path | str,
+    table: Table,
+    stand: StandTable | None = None,
+    *,
+    about: Mapping[str, str] | None = None,
+    log: Sequence[LogEntry] = (),
 ) -> Path:
-    """Write a workbook with the sheets Stems, Stand (where it is given) and About (likewise).
+    """Write a workbook with the sheets Stems, Stand (where it is given), Edits and About (likewise).
 
     Text is written as text: nothing in a note becomes a formula or a link.
 
@@ -27,6 +38,7 @@ def write_xlsx(
         table: The stems.
         stand: The stand table.
         about: Facts to go with it, such as how breast height was taken.
+        log: What was done to the plot.
 
     Raises:
         FileError: It cannot be written.
@@ -46,13 +58,15 @@ def write_xlsx(
         _stems(book, table, head)
         if stand is not None:
             _stand(book, stand, head)
+        if log:
+            _edits(book, log, head)
         if about:
             sheet = book.add_worksheet("About")
             sheet.set_column(0, 0, 28)
             sheet.set_column(1, 1, _WIDEST)
             for row, (name, text) in enumerate(about.items()):
                 sheet.write_string(row, 0, name, book.add_format({"bold": True}))
-                sheet.write_string(row, 1, text)
+                sheet.write_string(row, 1, without_controls(text)[:_LONGEST_CELL])
     with written_whole(path) as file:
         file.write(content.getvalue())
     return path
@@ -102,6 +116,20 @@ def _stand(book: Any, stand: StandTable, head: Any) -> None:
     sheet.write_string(below, 0, f"Horizontal area of the plot: {stand.area_m2:,.1f} m²")
     sheet.write_string(below + 1, 0, f"Stems outside the plot or without a place: {stand.n_outside}")
     sheet.write_string(below + 2, 0, "Basal area and mean diameters are those of the stems with a diameter.")
+    if stand.least_dbh_cm > 0:
+        least = Words(stand.units).diameter(stand.least_dbh_cm, unit=True)
+        sheet.write_string(below + 3, 0, f"Stems thinner than {least}, which are left out: {stand.n_thin}")
+
+
+def _edits(book: Any, log: Sequence[LogEntry], head: Any) -> None:
+    sheet = book.add_worksheet("Edits")
+    sheet.freeze_panes(1, 0)
+    for index, (name, width) in enumerate(zip(EDIT_COLUMNS, _EDIT_WIDTHS, strict=True)):
+        sheet.write_string(0, index, name, head)
+        sheet.set_column(index, index, width)
+    for at, entry in enumerate(log[-_MOST_ROWS:], start=1):
+        for index, cell in enumerate(cells(entry)):
+            _write(sheet, at, index, cell, None)
 
 
 def _write(sheet: Any, row: int, column: int, cell: Any, shown: Any) -> None:
@@ -111,4 +139,4 @@ def _write(sheet: Any, row: int, column: int, cell: Any, shown: Any) -> None:
     elif isinstance(cell, (int, float)):
         sheet.write_number(row, column, cell, shown)
     elif cell:
-        sheet.write_string(row, column, str(cell))
+        sheet.write_string(row, column, without_controls(str(cell))[:_LONGEST_CELL])
