@@ -3,7 +3,8 @@
     python bench/synthetic_360.py [--markers] [--data FOLDER] [--program COMMAND] [--args OPTIONS] [--inventory FILE]
 
 Runs `dbh-studio run dense_unscaled.ply --scale S` with the true scale, or with --markers lets the program take the
-scale from the markers in the panoramas, and prints a Markdown table of errors per tree.
+scale from the markers in the panoramas, and prints a Markdown table of errors per tree, and one of every method on the
+same trunks.
 The truth is for a tape at 1.30 m above the mean ground around the stem. Trees are matched by place. The program sets
 the plot upright in a frame of its own, so its map is first turned and moved (never scaled) onto the true one.
 """
@@ -11,6 +12,7 @@ the plot upright in a frame of its own, so its map is first turned and moved (ne
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import shlex
@@ -45,8 +47,51 @@ def scale_options(data: Path, scale: float, *, markers: bool) -> list[str]:
     return given
 
 
-def measured(data: Path, scale: float, options: argparse.Namespace) -> tuple[Table, str]:
-    """The program's inventory of the cloud, and what the run took."""
+METHODS = ("shrinkage", "circle", "fourier", "ellipse", "bspline")
+
+
+def every_method(folder: Path, options: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Diameters in cm by method and stem number, of the plot that a run left in a folder; NaN where refused."""
+    (plot,) = folder.glob("*.dbh")
+    table = folder / "methods.csv"
+    command = [*program_command(options.program), "measure", str(plot), "--csv", str(table), "--quiet"]
+    environment = {"PYTHONPATH": os.pathsep.join([str(HERE.parent / "src"), os.environ.get("PYTHONPATH", "")])}
+    outcome = run(command, limit_s=options.limit, log=folder / "measure.txt", environment=environment)
+    if outcome.exit_code != 0:
+        sys.exit(f"Measuring by every method ended with {outcome.exit_code}:\n{outcome.output[-2000:]}")
+    with table.open(encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {
+        method: {row["stem_id"]: float(row[f"{method}_cm"] or "nan") for row in rows if row["quality"] != "refused"}
+        for method in METHODS
+    }
+
+
+def method_table(found: Table, by_method: dict[str, dict[str, float]], data: Path) -> str:
+    """Markdown: the error of every method per true tree, each as it reads a tape, and what they come to."""
+    truth = read_table(data / "gt_dbh.csv", x="x", y="y", dbh="dbh_tape_cm")
+    pairs = pair(aligned(found, truth).xy_m, truth.xy_m)
+    lines = ["| tree | tape cm | " + " | ".join(METHODS) + " |", "|--:" * (2 + len(METHODS)) + "|"]
+    errors: dict[str, list[float]] = {method: [] for method in METHODS}
+    for mine, index in sorted(pairs.tolist(), key=lambda both: both[1]):
+        cells = []
+        for method in METHODS:
+            error = by_method[method].get(found.names[mine], float("nan")) - truth.dbh_cm[index]
+            errors[method].append(error)
+            cells.append("–" if np.isnan(error) else f"{error:+.2f}")
+        lines.append(f"| {truth.names[index]} | {truth.dbh_cm[index]:.1f} | " + " | ".join(cells) + " |")
+    for title, of in (
+        ("bias cm", np.nanmean),
+        ("median |error| cm", lambda e: np.nanmedian(np.abs(e))),
+        ("RMSE cm", lambda e: np.sqrt(np.nanmean(np.square(e)))),
+        ("measured", lambda e: np.isfinite(e).sum()),
+    ):
+        lines.append(f"| {title} | | " + " | ".join(f"{of(np.array(errors[m])):.4g}" for m in METHODS) + " |")
+    return "\n".join(lines)
+
+
+def measured(data: Path, scale: float, options: argparse.Namespace) -> tuple[Table, str, str]:
+    """The program's inventory of the cloud, what the run took, and the table of every method."""
     with tempfile.TemporaryDirectory(prefix="dbh-360-") as name:
         folder = Path(name)
         command = [*program_command(options.program), "run", str(data / "dense_unscaled.ply")]
@@ -58,7 +103,9 @@ def measured(data: Path, scale: float, options: argparse.Namespace) -> tuple[Tab
         if outcome.exit_code != 0 or table is None:
             sys.exit(f"The program ended with {outcome.exit_code}:\n{outcome.output[-2000:]}")
         memory = "?" if outcome.peak_mb is None else f"{outcome.peak_mb:.0f}"
-        return read_table(table), f"{outcome.seconds:.1f} s, {memory} MB"
+        found = read_table(table)
+        methods = method_table(found, every_method(folder, options), data)
+        return found, f"{outcome.seconds:.1f} s, {memory} MB", methods
 
 
 def error_table(found: Table, data: Path) -> str:
@@ -114,11 +161,13 @@ def main(given: Sequence[str] | None = None) -> int:
     known = json.loads((options.data / "world_from_model.json").read_text(encoding="utf-8"))
     scale = options.scale or float(known["metres_per_unit"])
     if options.inventory:
-        found, took = read_table(options.inventory), "not run"
+        found, took, methods = read_table(options.inventory), "not run", ""
     else:
-        found, took = measured(options.data, scale, options)
+        found, took, methods = measured(options.data, scale, options)
     how = "with markers" if options.markers else f"--scale {scale:.5f}"
     text = f"`dbh-studio run dense_unscaled.ply` {how}: {took}\n\n{error_table(found, options.data)}\n"
+    if methods:
+        text += f"\nEvery method on the same trunks: error against the tape, cm\n\n{methods}\n"
     print(text)
     results = HERE / "results"
     results.mkdir(exist_ok=True)
