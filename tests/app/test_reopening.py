@@ -72,6 +72,20 @@ def test_a_plot_of_an_earlier_program_opens_as_before_and_can_be_undone_from_now
     again.close()
 
 
+@pytest.mark.parametrize("read_only", [False, True])
+def test_what_is_lost_is_told_on_the_command_line_too(tmp_path, caplog, read_only):
+    path, folder = write_cloud(tmp_path), tmp_path / "plot.dbh"
+    session = open_plot(path, scale="metres", project_dir=folder)
+    session.do(commands.replace_trunks(make_trunks(5)))
+    session.close()
+    open_plot(folder, read_only=read_only).close()
+    assert not caplog.records
+    (folder / "undo.log").write_bytes(b"no log")
+    open_plot(folder, read_only=read_only).close()
+    (record,) = caplog.records
+    assert record.levelname == "WARNING" and "plot.dbh: What was done before cannot be undone" in record.message
+
+
 def test_a_cloud_that_was_moved_keeps_what_can_be_undone(tmp_path):
     path, folder = write_cloud(tmp_path), tmp_path / "plot.dbh"
     session = open_plot(path, scale="metres", project_dir=folder)

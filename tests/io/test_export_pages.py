@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from dbh_studio.io.exports import table_of
 from dbh_studio.io.exports.charts import distribution_svg
 from dbh_studio.io.exports.edit_log import decisions, history_entries, write_edits_csv
 from dbh_studio.io.exports.pages import Words, data_block
+from dbh_studio.io.exports.report_stems import stem_facts
 from dbh_studio.io.exports.scene_html import Scene, scene_html
 from dbh_studio.io.exports.stem_map import North, stem_map_svg
 from dbh_studio.io.history import HistoryEntry
@@ -85,6 +87,12 @@ def test_stems_of_one_tree_are_joined_and_feet_are_drawn_in_feet():
 def test_a_map_of_nothing_is_a_map():
     drawn = stem_map_svg(table_of(Inventory()), area=CIRCLE)
     assert "<polygon" in drawn and drawn.endswith("</svg>")
+
+
+@pytest.mark.parametrize(("method", "said"), [("drawn", "Ring drawn by hand, as"), ("fourier", "Fourier, as")])
+def test_what_a_diameter_was_read_from_has_a_name(method, said):
+    stem = replace(row(1, 20.0, 0, 0), dbh_method=method, dbh_definition="tape")
+    assert dict(stem_facts(stem, TreeRecord(), Words()))["Read from"].startswith(said)
 
 
 def test_the_log_in_both_units_and_safe_in_a_spreadsheet(tmp_path):

@@ -267,6 +267,66 @@ def test_a_tape_value_stands_beside_the_estimate(measured: FakeClient, studio: S
     assert studio.session.document.record(trunk_id).corrections == ()
 
 
+def test_what_a_correction_did_is_told_until_undo_takes_it_back(measured: FakeClient, studio: Studio) -> None:
+    trunk_id = table_ids(measured)[0]
+    choose(measured, trunk_id)
+    was = dbh(studio, trunk_id)
+    measured.set("Height (m)", 2.0)
+    measured.press("Measure at this height")
+    told = f"{was:.1f} → {dbh_at(studio, trunk_id, 2.0):.1f} cm"
+    measured.wait_text(told)
+    studio.session.undo()
+    measured.wait(lambda t: told not in t.text() and f'data-dbh="{was:.1f}"' in t.html())
+    studio.session.redo()
+    measured.wait_text(told)
+
+
+def dbh_at(studio: Studio, trunk_id: int, height_m: float) -> float:
+    document = commands.correct_measurement(trunk_id, Correction("breast_height", height_m)).apply(
+        studio.session.document
+    )
+    return studio.session.measurement(trunk_id, document=document).result.dbh_cm
+
+
+def test_a_tape_value_that_was_typed_is_kept_when_one_goes_on(measured: FakeClient, studio: Studio) -> None:
+    first, second, third = table_ids(measured)[:3]
+    choose(measured, first)
+    measured.set("Tape", "31.5")
+    choose(measured, second)
+    assert studio.session.document.record(first).correction("tape") == 31.5
+    measured.wait(lambda t: t.value("Tape") == "")
+    measured.set("Tape", "thick")
+    choose(measured, third)
+    measured.wait_notification(f"The tape value of tree {second} was not kept")
+    measured.wait(lambda t: t.value("Tape") == "")
+    assert not studio.session.document.record(second).corrections
+    assert not studio.session.document.record(third).corrections
+
+
+def test_with_several_chosen_it_is_said_which_one_is_corrected(measured: FakeClient, studio: Studio) -> None:
+    first, second = table_ids(measured)[:2]
+    choose(measured, first)
+    measured.bridge_send("row-add", second)
+    measured.wait_text(f"2 trees are chosen; only tree {second} is corrected here")
+    measured.set("Height (m)", 2.0)
+    measured.press("Measure at this height")
+    measured.wait_text("Breast height")
+    assert studio.session.document.record(second).correction("breast_height") == 2.0
+    assert not studio.session.document.record(first).corrections
+
+
+def test_what_was_found_along_the_stem_outlives_a_note(measured: FakeClient, studio: Studio) -> None:
+    trunk_id, other = table_ids(measured)[:2]
+    choose(measured, trunk_id)
+    measured.bridge_send("compare", None)
+    measured.wait(lambda t: "data-height-grip" in t.html())
+    studio.session.do(commands.describe_trees((other,), note="a fork"))
+    measured.wait(lambda t: "a fork" in t.html())
+    assert "data-height-grip" in measured.html()
+    studio.session.do(commands.correct_measurement(trunk_id, Correction("breast_height", 2.0)))
+    measured.wait(lambda t: "data-height-grip" not in t.html())
+
+
 def serial_of(measured: FakeClient, trunk_id: int) -> int:
     return int(measured.html().split(f"dbhSection.begin(&quot;out&quot;,{trunk_id},")[1].split(")")[0])
 

@@ -19,7 +19,8 @@ from dbh_studio.app.opening import open_plot
 from dbh_studio.app.session import Session
 from dbh_studio.errors import ProjectError, StudioError
 from dbh_studio.io.project import read_project
-from dbh_studio.ui.studio import RunningJob, Studio, project_dir_for
+from dbh_studio.ui.studio import Studio, project_dir_for
+from dbh_studio.ui.studio_jobs import RunningJob
 from dbh_studio.ui.tab import Tab
 from dbh_studio.ui.uploads import safe_name
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -42,6 +43,8 @@ from dbh_studio.io.project import (
 if TYPE_CHECKING:
     from dbh_studio.core.datacheck import DataCheck
     from dbh_studio.core.reconstruction import Reconstruction
+
+_log = logging.getLogger(__name__)
 
 # Called as ``read(path, progress=…)``.
 Reader = Callable[..., "Reconstruction"]
@@ -331,6 +334,8 @@ def _reopen(
         session = _session(reconstruction, document, check, read_only, history)
         # Beside a program that writes the plot, it is not closed as a matter of course.
         session.reopening_notes = (*(saved.lost if read_only else saved.notes), *notes)
+        for note in (*saved.lost, *notes):  # on the command line nobody else says it
+            _log.warning("%s: %s", folder.name, note)
         session.last_search = kept_search(folder, document)
         session.read_from = folder.absolute() if read_only else None
         session.offers = kept_offers(folder, document)

@@ -50,8 +50,10 @@ def _covered(places: Float64) -> Float64:
     cell = min(_CELL_M, float((dense[1] - dense[0]).max()) / _CELLS_ACROSS)
     if not cell > 0.0:
         return dense
-    cells, counts = np.unique(np.floor(places / cell), axis=0, return_counts=True)
-    middles = (cells[counts >= _LEAST_FILLED * np.median(counts)] + 0.5) * cell
+    # As complex numbers, which are sorted in a tenth of the time that pairs take.
+    cells, counts = np.unique(np.floor(places / cell) @ np.array([1, 1j]), return_counts=True)
+    filled = cells[counts >= _LEAST_FILLED * np.median(counts)]
+    middles = (np.column_stack([filled.real, filled.imag]) + 0.5) * cell
     low, high = np.quantile(middles, [_STRAY, 1 - _STRAY], axis=0)
     # What evenly covered ground loses to the share that may be stray, and to the middles of its cells.
     rim = (high - low) * _STRAY / (1 - 2 * _STRAY) + 0.5 * cell

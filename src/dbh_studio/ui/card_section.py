@@ -20,15 +20,15 @@ from dbh_studio.ui.review_section import ReviewSection, review_card
 from dbh_studio.ui.section_svg import section_svg
 
 if TYPE_CHECKING:
+    from dbh_studio.stages.measure import StemMeasurement
     from dbh_studio.ui.tab import Tab
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One tree looked at more closely, in one state of the plot."""
+    """One tree looked at more closely, as it is measured in one way."""
 
-    document: Document
-    trunk_id: int
+    measured: StemMeasurement
     result: DbhEstimate | Refusal
     profile: tuple[ProfilePoint, ...]
     height_m: float
@@ -59,7 +59,7 @@ class CardSection(Section):
         if stem is None:
             set_content(self._card, tree_card.waiting_card(selected))
             return
-        compared = self.compared(document, selected)
+        compared = self.compared(stem)
         result, profile = stem.result, ""
         if compared is not None:
             result = compared.result
@@ -68,7 +68,8 @@ class CardSection(Section):
         said = "" if entry is None else review_card(entry, record.review, n_chosen=len(self.tab.view.chosen))
         moved, serial = "", 0
         if self.correction is not None:
-            moved, serial = self.correction.moved(selected), self.correction.picture_serial(selected, result.section)
+            moved = self.correction.moved(selected, stem.result)
+            serial = self.correction.picture_serial(selected, result.section)
         said += corrections_html(record, result, moved)
         crossed = left_out_uv_m(session, document, selected, result.section) if result.section is not None else None
         picture = section_svg(result, curve=_drawn_curve(result, document), crossed_uv_m=crossed)
@@ -82,11 +83,10 @@ class CardSection(Section):
         card = tree_card.tree_card(selected, result, section=picture + profile, scale=scale, said=said, actions=actions)
         set_content(self._card, card + flag_html(selected, record.flag))
 
-    def compared(self, document: Document, trunk_id: int) -> Compared | None:
-        """What was found on looking more closely at a tree, if it is still so."""
+    def compared(self, stem: StemMeasurement) -> Compared | None:
+        """What was found on looking more closely at a tree, if it is still measured so."""
         found = self._compared
-        is_current = found is not None and found.document is document and found.trunk_id == trunk_id
-        return found if is_current else None
+        return found if found is not None and found.measured is stem else None
 
     def _compare(self, _: Any = None) -> None:
         """Measure the chosen tree by every method and all along the stem, for the pictures."""
@@ -96,6 +96,7 @@ class CardSection(Section):
         document = session.document
         if not document.scale.is_known or selected not in document.trunks:
             return
+        stem = session.measurement(selected, document=document)
         result = session.compared(selected, document=document).result
         profile = session.profile(selected, document=document)
         height_m = result.hom_m if isinstance(result, DbhEstimate) else document.settings.measure.breast_height_m
@@ -104,7 +105,7 @@ class CardSection(Section):
             flag = breast_height_flag(profile, height_m, result.diameters[result.definition], scale_sd=scale_sd)
             if flag is not None:
                 result = replace(result, flags=(*result.flags, flag.words), flag_codes=(*result.flag_codes, flag.code))
-        self._compared = Compared(document, selected, result, profile, height_m)
+        self._compared = Compared(stem, result, profile, height_m)
         self.refresh()
 
 

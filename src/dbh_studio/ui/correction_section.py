@@ -23,7 +23,7 @@ from dbh_studio.app.section_edits import (
 )
 from dbh_studio.app.session import Session
 from dbh_studio.core.corrections import CORRECTION_KINDS, Correction, CorrectionKind
-from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.core.dbh import DbhEstimate, Refusal
 from dbh_studio.core.section import CrossSection
 from dbh_studio.core.section_drawing import CURVE_TITLES
 from dbh_studio.errors import CommandError
@@ -43,6 +43,7 @@ _CHOICES: dict[CorrectionKind, tuple[str, dict[str, str]]] = {
     "above": ("Measure it above", {"nothing": "nothing", "bulge": "bulge", "buttress": "buttress"}),
 }
 _ARROWS = "/breast-height"
+_Result = DbhEstimate | Refusal
 
 
 class CorrectionSection(Section):
@@ -53,11 +54,12 @@ class CorrectionSection(Section):
         gui, worker, bridge = self.gui, self.tab.worker, self.tab.bridge
         bridge.run(resources.files("dbh_studio.ui").joinpath("section_tools.js").read_text(encoding="utf-8"))
         self._picture: tuple[int, int, CrossSection] | None = None
-        self._moved: tuple[Session, int, str] | None = None
-        self._shown: object = None
+        self._moved: tuple[Session, int, _Result, _Result] | None = None
+        self._shown: tuple[Session, int, tuple[Correction, ...], float] | None = None
         self._is_placing_ground = False
         self._arrows: viser.TransformControlsHandle | None = None
         with gui.add_folder("Correct this measurement", expand_by_default=False, visible=False) as self._folder:
+            self._these = gui.add_html("", visible=False)
             self._why = gui.add_text("Why", "", hint="kept with what you change next; may stay empty")
             self._height = gui.add_number("Height (m)", 1.3, min=0.1, max=20.0, step=0.01, hint="above the base")
             self._steps = gui.add_button_group("Raise or lower", tuple(_STEPS))
@@ -100,7 +102,7 @@ class CorrectionSection(Section):
         record, measure = document.record(selected), document.settings.measure
         said = (session, selected, record.corrections, measure.breast_height_m)
         if said != self._shown:
-            if self._shown is None or said[:2] != self._shown[:2]:  # type: ignore[index]
+            if self._shown is None or said[:2] != self._shown[:2]:
                 self._stop_gestures()
                 for handle in (self._tape, self._tape_height, self._why):
                     set_value(handle, "")
@@ -109,9 +111,28 @@ class CorrectionSection(Section):
             for kind, choice in self._choices.items():
                 titles = {name: title for title, name in _CHOICES[kind][1].items()}
                 set_value(choice, titles.get(record.correction(kind), _AS_PLOT))
+        n_chosen = len(self.tab.view.chosen)
+        if n_chosen > 1:
+            words = f"{n_chosen} trees are chosen; only tree {selected} is corrected here."
+            set_content(self._these, html.message(words))
+        set_visible(self._these, n_chosen > 1)
         if self._is_placing_ground:
             set_content(self._state, html.message("Click the ground beside the stem, in the picture. Esc stops."))
         set_visible(self._state, self._is_placing_ground)
+
+    def leave_tree(self) -> None:
+        """Keep the tape value that was typed about the tree that was on screen, as its button does."""
+        session, shown, text = self.tab.session, self._shown, str(self._tape.value).strip()
+        if session is None or shown is None or shown[:2] != (session, self.tab.view.selected) or not text:
+            return
+        if session.is_read_only or shown[1] not in session.document.trunks:
+            return
+        try:
+            self._typed_tape()
+        except CommandError as error:  # nobody is held back by it
+            told = f"The tape value of tree {shown[1]} was not kept. {error.problem}"
+            self.tab.worker.notify_error(CommandError(told, error.remedy))
+            set_value(self._tape, "")
 
     def picture_serial(self, trunk_id: int, section: CrossSection | None) -> int:
         """The number of the picture of a section: another one for every other section."""
@@ -123,11 +144,12 @@ class CorrectionSection(Section):
         assert self._picture is not None
         return self._picture[0]
 
-    def moved(self, trunk_id: int) -> str:
-        """What the last correction of a tree did to its number; empty where there was none in this tab."""
-        moved = self._moved
-        is_it = moved is not None and moved[0] is self.tab.session and moved[1] == trunk_id
-        return moved[2] if moved is not None and is_it else ""
+    def moved(self, trunk_id: int, result: _Result) -> str:
+        """What the last correction of a tree in this tab did to its number; empty once that is another, as by Undo."""
+        if self._moved is None or self._moved[0] is not self.tab.session or self._moved[1] != trunk_id:
+            return ""
+        _, _, was, now = self._moved
+        return "" if moved_words(now, result) else moved_words(was, now)
 
     # ---- correcting
 
@@ -150,7 +172,7 @@ class CorrectionSection(Section):
         after = command.apply(before)
         if after is not before and session.has_ground():
             was, now = (session.measurement(trunk_id, document=each).result for each in (before, after))
-            self._moved = session, trunk_id, moved_words(was, now)
+            self._moved = session, trunk_id, was, now
         session.do(command)
 
     def _chosen_tree(self) -> tuple[Session, int]:

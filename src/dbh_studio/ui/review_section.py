@@ -227,7 +227,7 @@ def review_card(entry: QueueEntry, review: Review | None, *, n_chosen: int = 1) 
         said += "</div>"
     these = f" these {n_chosen}" if n_chosen > 1 else " without DBH" if entry.quality == "refused" else ""
     why = f'<div class="dbh-why" title="Why it comes now">{esc(plain(reasons))}</div>' if reasons else ""
-    fine = "" if reasons or entry.concern == "refused" else "<span>Nothing stands out.</span>"
+    fine = "" if reasons or entry.concern == "refused" or n_chosen > 1 else "<span>Nothing stands out.</span>"
     return (
         f'<div class="dbh-decide" data-concern="{esc(entry.concern)}">{why}{said}<div>'
         f'<button type="button" data-do="accept" title="Right as it is; go to the next one (Space)" '

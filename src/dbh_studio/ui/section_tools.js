@@ -7,6 +7,12 @@ window.dbhSection = window.dbhSection || (() => {
     keep: 'Draw round the points to keep.',
     ring: 'Click corners along the bark; click the first one again, or press Enter, to close the ring.',
   };
+  const LEAST = {out: 3, keep: 3, ring: 4};
+  const AGAIN = {
+    out: 'Hold the button down while you draw.',
+    keep: 'Hold the button down while you draw.',
+    ring: 'Four corners or more make a ring.',
+  };
   let mode = null, corners = [], isDown = false, layer = null, handle = null;
 
   const picture = () => mode && document.querySelector(`.dbh-card[data-tree="${mode.tree}"] svg.dbh-section`);
@@ -18,13 +24,13 @@ window.dbhSection = window.dbhSection || (() => {
     const [u, v, half] = svg.dataset.frame.split(' ').map(Number);
     return [u + (2 * x / SIZE - 1) * half, v + (1 - 2 * y / SIZE) * half].map((m) => Math.round(m * 1e5) / 1e5);
   };
-  function say() {
+  function say(more = '') {
     document.querySelectorAll('.dbh-cut-tools button[data-draw]').forEach((button) => {
       button.setAttribute('aria-pressed', !!mode && mode.kind === button.dataset.draw);
     });
     const line = document.querySelector('.dbh-cut-hint');
     if (!line) return;
-    line.textContent = mode ? `${WORDS[mode.kind]} Esc stops.` : '';
+    line.textContent = mode ? `${more || WORDS[mode.kind]} Esc stops.` : '';
     const svg = picture();
     if (svg) svg.style.cursor = 'crosshair';
   }
@@ -65,9 +71,14 @@ window.dbhSection = window.dbhSection || (() => {
   }
   function send() {
     const svg = picture();
-    if (svg && corners.length >= 3) {
-      dbh('section-draw', [mode.kind, mode.tree, mode.serial, corners.map((c) => metres(svg, c))]);
+    if (svg && corners.length < LEAST[mode.kind]) {  // no more than a click: the tool stays in hand
+      isDown = false;
+      if (mode.kind !== 'ring') corners = [];
+      draw();
+      say(AGAIN[mode.kind]);
+      return;
     }
+    if (svg) dbh('section-draw', [mode.kind, mode.tree, mode.serial, corners.map((c) => metres(svg, c))]);
     stop();
   }
   const far = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1]);
@@ -92,6 +103,7 @@ window.dbhSection = window.dbhSection || (() => {
     } else if (!corners.length || far(at, corners[corners.length - 1]) > 3) {
       corners.push(at);
       draw();
+      say();
     }
   });
   document.addEventListener('pointermove', (event) => {
@@ -108,12 +120,28 @@ window.dbhSection = window.dbhSection || (() => {
     if (handle) { drop(event); return; }
     if (isDown) send();
   });
-  // Before the page's own keys: Esc and Enter belong to what is being drawn.
-  window.addEventListener('keydown', (event) => {
-    if (!mode) return;
+  // Before the page's own keys: what is being drawn has the first claim on them.
+  const isMeantFor = (event, selector) => event.target instanceof Element && !!event.target.closest(selector);
+  const isDecision = (event) => !event.ctrlKey && !event.metaKey && !event.altKey && /^[ lL]$/.test(event.key);
+  function keyTaken(event) {
+    if (isMeantFor(event, 'input,textarea,select,[contenteditable]')) return false;
+    const decides = isDecision(event) && !isMeantFor(event, 'button');
+    // A key that is held down repeats itself: one press is one decision.
+    if (decides && event.repeat) return true;
+    if (handle && event.key === 'Escape') { letGo(); return true; }
+    if (mode && !picture()) stop();
+    if (!mode) return false;
     if (event.key === 'Escape') stop();
-    else if (event.key === 'Enter' && mode.kind === 'ring') send();
-    else return;
+    else if (mode.kind !== 'ring') { if (decides) say(); return decides; }
+    else if (event.key === 'Enter') send();
+    else if (corners.length && (event.key === 'Backspace' || ((event.ctrlKey || event.metaKey) && event.key === 'z'))) {
+      corners.pop();
+      draw();
+    } else { if (decides) say('Press Enter to close the ring first.'); return decides; }
+    return true;
+  }
+  window.addEventListener('keydown', (event) => {
+    if (!keyTaken(event)) return;
     event.stopImmediatePropagation();
     event.preventDefault();
   }, true);
@@ -139,6 +167,11 @@ window.dbhSection = window.dbhSection || (() => {
     if (Math.abs(height - Number(handle.dataset.height)) > 0.004) {
       dbh('height-set', [tree, Math.round(height * 100) / 100]);
     }
+    handle = null;
+  }
+  function letGo() {
+    handle.removeAttribute('transform');
+    handle.querySelector('text').textContent = `${Number(handle.dataset.height).toFixed(2)} m`;
     handle = null;
   }
   return {begin, stop};

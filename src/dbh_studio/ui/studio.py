@@ -9,7 +9,6 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,12 @@ import platformdirs
 from dbh_studio.app import pipeline
 from dbh_studio.app.autosave import Autosave, SaveStatus
 from dbh_studio.app.document import Document
-from dbh_studio.app.jobs import Job, run_job
+from dbh_studio.app.jobs import run_job
 from dbh_studio.app.opening import open_plot, plot_name, read_cloud
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.progress import Progress
 from dbh_studio.core.reconstruction import Reconstruction
-from dbh_studio.errors import CancelledError, FileError, ProjectError, ProjectLockedError, StudioError
+from dbh_studio.errors import FileError, ProjectError, ProjectLockedError, StudioError
 from dbh_studio.io.project import FOLDER_SUFFIX, is_project
 from dbh_studio.io.reader import SUPPORTED_SUFFIXES
 from dbh_studio.ui.bind import TabWorker, for_each_tab
@@ -36,6 +35,7 @@ from dbh_studio.ui.photo_desk import PhotoDesk
 from dbh_studio.ui.photo_render import PhotoCache
 from dbh_studio.ui.returning import LostPages
 from dbh_studio.ui.server import StudioServer
+from dbh_studio.ui.studio_jobs import BusyError, RunningJob, StudioJobs
 from dbh_studio.ui.tab import Tab
 from dbh_studio.ui.uploads import UploadedFile, receive
 
@@ -48,22 +48,7 @@ _LONGEST_NAME = 200
 _BETWEEN_NOTES_S = 2.0
 
 
-class BusyError(StudioError):
-    """Another job is running."""
-
-
-@dataclass(eq=False)
-class RunningJob:
-    """What the progress bar shows and Cancel stops."""
-
-    title: str
-    stop: Callable[[], object]
-    fraction: float = 0.0
-    message: str = ""
-    if_stopped: str = "nothing was changed."
-
-
-class Studio:
+class Studio(StudioJobs):
     """Holds the open plot and the running job, and tells the tabs.
 
     Args:
@@ -75,23 +60,20 @@ class Studio:
     def __init__(
         self, server: StudioServer, *, uploads_folder: Path | None = None, display_points: int = DEFAULT_DISPLAY_POINTS
     ) -> None:
+        super().__init__()
         self.server = server
-        self.session: Session | None = None
         self.display: DisplayCloud | None = None
         self.segmentation_notes: tuple[str, ...] = ()
         self.markers = MarkerFinds(self)
         self._uploads_folder = uploads_folder or Path(platformdirs.user_data_dir("dbh-studio")) / "plots"
         self._display_points = display_points
-        self._tabs: dict[int, Tab] = {}
         self.lost_pages = LostPages()
-        self._job: RunningJob | None = None
         self._end_session: Callable[[], None] = lambda: None
         self._problem_told = ""
         self._others_told_at = -_BETWEEN_NOTES_S
         # The plot of which it was told how it was opened.
         self._opening_told: Session | None = None
         self._exported: Document | None = None
-        self._lock = threading.RLock()
         self.photo_cache = PhotoCache()
         self.photos = PhotoDesk(self, run=self.start_job, tell=self._each_tab)
         self.masks = MaskDesk(self, tell=self._each_tab)
@@ -124,12 +106,6 @@ class Studio:
     def refresh_tabs(self) -> None:
         """Show in every tab what has changed beside the document."""
         self._each_tab(Tab.refresh)
-
-    def _each_tab(self, action: Callable[[Tab], Any]) -> None:
-        with self._lock:
-            tabs = list(self._tabs.values())
-        for tab in tabs:
-            tab.worker.post(action, tab)
 
     # ---- the open plot
 
@@ -271,12 +247,6 @@ class Studio:
 
     # ---- long work
 
-    def cancel_job(self) -> None:
-        """Stop what runs; nothing of it is kept."""
-        job = self._job
-        if job is not None:
-            job.stop()
-
     def open_plot(self, path: Path, **options: Any) -> None:
         """Read a plot in the background and show it. `options` as for `pipeline.open_plot`.
 
@@ -294,57 +264,6 @@ class Studio:
     def keep_upload(self, uploaded: UploadedFile) -> Path:
         """Where an uploaded file is kept from now on."""
         return receive(uploaded, self._uploads_folder, allowed_suffixes=self.suffixes())
-
-    def _stoppable(self, running: RunningJob, cancelled: threading.Event) -> tuple[Progress, Callable[[Job], object]]:
-        """How work in a thread reports, and how it tells of the child process that Cancel must end."""
-
-        def progress(fraction: float, message: str = "") -> None:
-            if cancelled.is_set():
-                raise CancelledError
-            self._show_progress(running, fraction, message)
-
-        def started(job: Job) -> None:
-            def stop() -> None:
-                cancelled.set()
-                job.cancel()
-
-            running.stop = stop
-            if cancelled.is_set():
-                job.cancel()
-
-        return progress, started
-
-    def start_work(
-        self,
-        title: str,
-        work: Callable[[Progress, Callable[[Job], object]], Any],
-        session: Session,
-        done: Callable[[Any], None],
-    ) -> None:
-        """As `start_job`, for work that starts its child process itself, if it needs one: `work(progress, started)`.
-
-        Raises:
-            BusyError: Another job runs.
-        """
-        cancelled = threading.Event()
-        running = RunningJob(title, cancelled.set)
-        progress, started = self._stoppable(running, cancelled)
-
-        def run() -> None:
-            try:
-                result = work(progress, started)
-                self._end(running)
-                if session is self.session:
-                    done(result)
-            except StudioError as error:
-                self._fail(running, error)
-            except Exception:
-                log.exception("%s failed", title)
-                self._fail(running, StudioError("Unexpected error.", "The program's log has the details."))
-            self.measure_missing()
-
-        self._claim(running)
-        threading.Thread(target=run, daemon=True, name="work").start()
 
     def _open(self, running: RunningJob, path: Path, options: dict[str, Any], cancelled: threading.Event) -> None:
         progress, started = self._stoppable(running, cancelled)
@@ -440,85 +359,6 @@ class Studio:
         if self.session is None:
             raise StudioError("No plot is open.", "Open one in step 1.")
         return self.session
-
-    def start_job(
-        self,
-        title: str,
-        function: Callable[..., Any],
-        args: tuple[Any, ...],
-        session: Session,
-        done: Callable[[Any], None],
-        *,
-        failed: Callable[[StudioError], object] = lambda _: None,
-        if_stopped: str = RunningJob.if_stopped,
-    ) -> None:
-        """Run `function` in a child process, then `done` with its result if `session` is still the open plot.
-
-        Raises:
-            BusyError: Another job runs.
-        """
-
-        def finish(result: Any) -> None:
-            # The bar goes first: what `done` changes may start the next job.
-            self._end(running)
-            if session is self.session:
-                done(result)
-            self.measure_missing()
-
-        def fail(error: StudioError) -> None:
-            self._fail(running, error)
-            failed(error)
-
-        def progress(fraction: float, message: str = "") -> None:
-            self._show_progress(running, fraction, message)
-
-        job = Job(function, args, on_progress=progress, on_done=finish, on_error=fail)
-        # Claimed before it starts: a Cancel pressed while the process is being made counts.
-        running = RunningJob(title, job.cancel, if_stopped=if_stopped)
-        self._claim(running)
-        job.start()
-
-    def _fail(self, job: RunningJob, error: StudioError) -> None:
-        self._end(job)
-        if isinstance(error, CancelledError):
-            self._each_tab(lambda tab: tab.worker.notify("Cancelled", f"{job.title}: {job.if_stopped}", "info"))
-        else:
-            self._each_tab(lambda tab: tab.worker.notify_error(error))
-
-    def _claim(self, job: RunningJob) -> None:
-        with self._lock:
-            if self._job is not None:
-                raise BusyError(f"{self._job.title} is still running.", "Wait for it, or press Cancel.")
-            self._job = job
-        self._show_job()
-
-    def _show_progress(self, job: RunningJob, fraction: float, message: str = "") -> None:
-        job.fraction, job.message = fraction, message
-        self._show_job()
-
-    def _end(self, job: RunningJob) -> None:
-        """Let go of the claim, unless it is another's by now."""
-        with self._lock:
-            if self._job is not job:
-                return
-            self._job = None
-        self._show_job()
-
-    def _show_job(self) -> None:
-        with self._lock:
-            tabs = list(self._tabs.values())
-        for tab in tabs:
-            tab.worker.post_latest("job", lambda tab=tab: tab.show_job(self._job))
-
-    def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until no job runs and every tab has caught up; for tests and scripts."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            tabs = list(self._tabs.values())
-            if self._job is None and all(tab.worker.join(0.05) for tab in tabs) and self._job is None:
-                return True
-            time.sleep(0.02)
-        return False
 
     def close(self) -> None:
         """Stop the job, save the plot, end the server."""

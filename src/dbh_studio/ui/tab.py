@@ -40,7 +40,8 @@ from dbh_studio.ui.view_state import ViewState
 
 if TYPE_CHECKING:
     from dbh_studio.stages.measure import StemMeasurement
-    from dbh_studio.ui.studio import RunningJob, Studio
+    from dbh_studio.ui.studio import Studio
+    from dbh_studio.ui.studio_jobs import RunningJob
 
 log = logging.getLogger(__name__)
 

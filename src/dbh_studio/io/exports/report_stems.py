@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator
 
+from dbh_studio.core.drawn_ring import DRAWN
 from dbh_studio.core.inventory import InventoryRow
 from dbh_studio.core.markup import markup
 from dbh_studio.core.section_drawing import CURVE_TITLES, section_drawing
@@ -63,7 +64,8 @@ def stem_facts(row: InventoryRow, record: TreeRecord, words: Words) -> Iterator[
         yield "Why", row.reason
         yield "What would help", row.remedy
     else:
-        curve = CURVE_TITLES.get(row.dbh_method, row.dbh_method)
+        is_drawn = row.dbh_method == DRAWN
+        curve = "Ring drawn by hand" if is_drawn else CURVE_TITLES.get(row.dbh_method, row.dbh_method)
         yield "Read from", f"{curve}, {_DEFINITIONS.get(row.dbh_definition, row.dbh_definition)}"
         yield "To look at", row.reason
     if row.hom_m is not None:
