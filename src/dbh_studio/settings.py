@@ -312,7 +312,8 @@ class EstimatorSettings(SettingsModel):
         "Diameter",
         help="tape: convex girth/π; curve: perimeter/π (the paper); area: of the equal circle",
     )
-    breast_height_m: float = setting(1.30, "Height of measurement", unit="m", ge=0.1, le=100.0)
+    # Lower than the 0.1 m a person may ask for: along a stem that leans by 45° that is 0.07 m above the base.
+    breast_height_m: float = setting(1.30, "Height of measurement", unit="m", ge=0.05, le=100.0)
     below_m: float = setting(
         0.50, "Stem used below", unit="m", ge=0.05, le=2.0, help="axis and taper are found from this stretch of stem"
     )

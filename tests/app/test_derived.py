@@ -76,7 +76,7 @@ def test_a_scale_of_the_same_size_from_elsewhere_measures_nothing_again():
     assert stages.measured == []
     session.do(commands.set_scale(ScaleEstimate(1.0, "marker", 0.02)))  # which every interval has in it
     session.measurements()
-    assert stages.measured == [1, 2]
+    assert sorted(stages.measured) == [1, 2]  # two threads, in either order
     assert rows[0].scale_source == "marker" and rows[0].scale_err_pct == pytest.approx(1.0)
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dbh_studio.core.corrections import Correction
 from dbh_studio.core.dbh import DbhEstimate, measure_stem
+from dbh_studio.core.inventory import TreeRecord, inventory_row
 from dbh_studio.core.measured import Diameter
 from dbh_studio.core.protocol_measure import measure_by_protocol
-from dbh_studio.core.protocols import PROTOCOLS, Protocol
+from dbh_studio.core.protocols import PROTOCOLS, Protocol, own_settings
+from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.stem_course import stem_course
 from dbh_studio.core.swelling import profile_flag
 from dbh_studio.core.transforms import Similarity
@@ -121,6 +124,8 @@ class TestAbove:
         assert result.code == "not_regular"
         assert "buttress" in result.reason and "1.9 m" in result.reason and "by hand" in result.remedy
         assert result.section is not None and result.fits
+        (ring,) = result.rings
+        assert ring.radius_m == pytest.approx(result.section.ring_radius_m, rel=0.1)
 
     @pytest.mark.parametrize("curve", ["circle", "fourier"])
     def test_whichever_method(self, curve):
@@ -142,11 +147,49 @@ class TestAlong:
         assert along.dbh_cm == pytest.approx(200 * (0.25 - 0.03 * 1.30), rel=0.006)
         assert upright.dbh_cm == pytest.approx(200 * (0.25 - 0.03 * 1.30 / cosine), rel=0.006)
 
+    def test_the_lowest_height_a_person_may_ask_for(self):
+        """Along the stem it is lower than that above the base, which must not stop a plot from being measured."""
+        settings = own_settings([Correction("breast_height", 0.1), Correction("along", "stem")], SMOOTH)
+        result = measure_by_protocol(stem(lean_deg=25.0, z=(0.0, 4.0)), settings=settings)
+        assert result.hom_m == pytest.approx(0.1 * np.cos(np.radians(25.0)), abs=0.001)
+        assert result.dbh_cm == pytest.approx(200 * (0.2 - 0.005 * 0.1), rel=0.02)
+
     def test_an_upright_stem_is_measured_the_same(self):
         one = measure_by_protocol(stem(), settings=SMOOTH)
         other = measure_by_protocol(stem(), settings=SMOOTH.changed(along="stem"))
         assert one.dbh_cm == pytest.approx(other.dbh_cm, rel=1e-4)
         assert other.hom_m == pytest.approx(1.30, abs=0.002)
+
+
+class TestAssumedAxis:
+    """What was not measured is not told as measured, nor as 0."""
+
+    @pytest.mark.parametrize(
+        ("points", "options", "source"),
+        [
+            (stem(), {"curve": "circle", "axis": "vertical"}, "vertical"),
+            (stem(z=(1.2, 1.45)), {}, "prior"),
+            (stem(), {}, "stem"),
+            (stem(), {"curve": "circle"}, "stem"),
+        ],
+        ids=["vertical", "short", "shrinkage", "circle"],
+    )
+    def test_lean_and_taper_are_of_the_stem_or_unknown(self, points, options, source):
+        result = measure_stem(points, settings=SMOOTH.changed(**options))
+        row = inventory_row(
+            result,
+            plot_id="plot",
+            stem_id=1,
+            record=TreeRecord(),
+            xy_m=np.zeros(2),
+            z_ground_m=0.0,
+            scale=ScaleEstimate(1.0, "factor"),
+        )
+        assert result.section.axis_source == source
+        if source == "stem":
+            assert row.lean_deg == pytest.approx(0.0, abs=0.3) and row.taper_cm_per_m == pytest.approx(1.0, abs=0.4)
+        else:
+            assert (row.lean_deg, row.taper_cm_per_m) == (None, None)
 
 
 class TestProfile:

@@ -57,6 +57,14 @@ class TestTwoStems:
         np.testing.assert_allclose(result.rings[1].centre_m, [apart, 0], atol=0.01)
         assert result.rings[0].n_points > result.rings[1].n_points
 
+    def test_a_seed_given_is_as_good_as_one_in_the_settings(self):
+        points = np.concatenate([pipe(arc_deg=200.0, noise=0.01), pipe(0.3, radius=0.11, n=1200, noise=0.01, seed=1)])
+        given, set_so = assess_stem(points, seed=7), assess_stem(points, settings=EstimatorSettings(seed=7))
+        assert len(given.result.rings) == 2
+        for one, other in zip(given.result.rings, set_so.result.rings, strict=True):
+            assert (one.radius_m, one.n_points) == (other.radius_m, other.n_points)
+        assert given.result.diameters == set_so.result.diameters
+
     def test_the_words_say_how_far_and_how_thick(self):
         points = np.concatenate([pipe(), pipe(0.45, radius=0.1, n=1000, seed=1)])
         (words,) = [flag.words for flag in estimate_diameter(points).flags if flag.code == "neighbour"]

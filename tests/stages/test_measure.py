@@ -248,6 +248,22 @@ def test_heights_count_from_the_side_of_the_slope_that_is_asked_for(base, rise, 
     assert found.protocol == Protocol(1.30, base, "vertical", "nothing")
 
 
+@pytest.mark.parametrize("along", ["stem", "vertical"])
+def test_a_ring_drawn_at_breast_height_along_a_leaning_stem_lies_there(along):
+    settings = SMOOTH.changed(along=along)
+    points = stem(lean_deg=25.0, n=8000)
+    plain = measured(points, Slope(), settings=settings)
+    angle = np.arange(48) * (2 * np.pi / 48)
+    section = np.column_stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), np.zeros(48)])
+    ring = plain.result.section.stem_from_section.apply(section)
+    drawn = measured(points, Slope(), settings=settings, ring_m=ring)
+    assert drawn.result.hom_m == pytest.approx(plain.result.hom_m, abs=0.005)
+    assert drawn.result.flag_codes == ("drawn",)
+    assert drawn.protocol.breast_height_m == 1.30 and drawn.protocol.along == along
+    higher = measured(points, Slope(), settings=settings, ring_m=ring + [0.0, 0.0, 0.2])
+    assert "not_at_height" in higher.result.flag_codes
+
+
 def test_what_is_placed_goes_before_the_slope_and_is_told():
     points = stem(x=5, base=2.5)
     found = measured(points, Slope(rise=0.5), settings=SMOOTH.changed(base="uphill"), z_ground_m=2.8)

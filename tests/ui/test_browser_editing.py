@@ -254,6 +254,24 @@ def test_what_a_lasso_selects_is_taken_off_and_undone_to_the_start(page: Any, st
     assert stems(exported(page, studio, tmp_path)) == stems(first)
 
 
+def test_delete_held_down_takes_the_points_off_and_leaves_the_trunk(page: Any, studio: Studio) -> None:
+    session = session_of(studio)
+    tree = session.document.trunks.ids[0]
+    choose_by_click(page, studio, tree)
+    target = breast_height(studio, tree)
+    look_at(page, studio, target)
+    take(page, studio, "lasso", "3")
+    x, y = browser.pixel_of(page, target)
+    draw(page, (x, y - 160), (x + 120, y - 160), (x + 120, y + 250), (x, y + 250), (x, y - 158))
+    wait_words(page, "chosen", "selected")
+    for _ in range(3):
+        page.keyboard.down("Delete")
+    page.keyboard.up("Delete")
+    wait_words(page, "effect", f"Tree {tree}:")
+    browser.settle(page, studio)
+    assert tree in session.document.trunks
+
+
 def test_the_brush_follows_the_pointer_and_the_view_stays(page: Any, studio: Studio) -> None:
     session = session_of(studio)
     tree = session.document.trunks.ids[0]

@@ -256,3 +256,47 @@ def test_a_refused_tree_is_given_a_number_from_its_card(page: Any, studio: Studi
     browser.settle(page, studio)
     assert session.document.record(trunk_id).correction("tape") == 33.5
     assert isinstance(session.measurement(trunk_id).result, DbhEstimate)
+
+
+def test_one_press_of_space_is_one_decision_and_none_is_made_while_one_draws(page: Any, studio: Studio) -> None:
+    session = studio.session
+    assert session is not None
+    ids = rows(page)
+
+    def reviewed() -> list[int]:
+        return [i for i in ids if session.document.record(i).review]
+
+    page.click(f".dbh-trees tr[data-id='{ids[0]}']")
+    page.wait_for_selector(f".dbh-card[data-tree='{ids[0]}'] .dbh-section")
+    browser.settle(page, studio)
+    for _ in range(4):  # a key that is held down repeats itself
+        page.keyboard.down("Space")
+    page.keyboard.up("Space")
+    browser.settle(page, studio)
+    assert reviewed() == ids[:1]
+
+    # Too little was drawn: the tool stays in hand and says what is missing.
+    page.click(f".dbh-trees tr[data-id='{ids[1]}']")
+    page.wait_for_selector(f".dbh-card[data-tree='{ids[1]}'] .dbh-section")
+    browser.settle(page, studio)
+    page.click("button[data-draw=out]")
+    page.mouse.click(*in_section(page, 0.0, 0.0))
+    page.get_by_text("Hold the button down while you draw.").wait_for()
+    page.wait_for_selector("button[data-draw=out][aria-pressed=true]")
+    page.click("button[data-draw=ring]")
+    for corner in [(0.15, 0.0), (0.0, 0.15), (-0.15, 0.0), (0.0, -0.15), (0.1, -0.1)]:
+        page.mouse.click(*in_section(page, *corner))
+    undo_label = session.undo_label
+    press(page, studio, "Control+z")
+    press(page, studio, "Backspace")
+    assert page.locator("[data-drawn=ring] circle").count() == 3 and session.undo_label == undo_label
+    press(page, studio, "Enter")
+    page.get_by_text("Four corners or more make a ring.").wait_for()
+    press(page, studio, "Space")
+    page.get_by_text("Press Enter to close the ring first.").wait_for()
+    assert reviewed() == ids[:1]
+    page.mouse.click(*in_section(page, 0.0, -0.15))
+    page.keyboard.press("Enter")
+    page.wait_for_selector("[data-correction=ring]")
+    press(page, studio, "Space")
+    assert reviewed() == ids[:2]

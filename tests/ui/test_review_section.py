@@ -14,6 +14,7 @@ from dbh_studio.core.corrections import Correction
 from dbh_studio.core.dbh import DbhEstimate, Refusal
 from dbh_studio.core.measured import Diameter
 from dbh_studio.core.review_queue import ReviewProgress
+from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.stem_profile import ProfilePoint
 from dbh_studio.ui.bind import CAMERA_KEYS
 from dbh_studio.ui.correction_html import remedies_html
@@ -139,6 +140,26 @@ def test_the_bar_offers_only_what_there_is() -> None:
 
 
 # ---- several trees
+
+
+def test_the_bar_stays_while_every_tree_is_measured_again(
+    measured: FakeClient, studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ids = table_ids(measured)
+    measured.wait_text(f"0 of {len(ids)} reviewed")
+    monkeypatch.setattr(studio.session, "unmeasured", lambda document=None: tuple(ids))
+    studio.session.do(commands.describe_trees((ids[0],), note="a fork"))
+    measured.wait(lambda t: t.text().count("not measured yet") == len(ids))
+    measured.wait_text(f"0 of {len(ids)} reviewed")
+    assert not measured.has("Accept")
+
+
+def test_a_filter_hides_no_tree_where_there_is_no_queue_any_more(measured: FakeClient, studio: Studio) -> None:
+    ids = table_ids(measured)
+    measured.bridge_send("review-filter", "doubtful")
+    measured.wait_text("No tree is of this kind")
+    studio.session.do(commands.set_scale(ScaleEstimate()))
+    measured.wait(lambda t: table_ids(t) == ids)
 
 
 def test_two_trees_get_their_species_at_once(measured: FakeClient, studio: Studio) -> None:
@@ -310,8 +331,7 @@ def test_with_several_chosen_it_is_said_which_one_is_corrected(measured: FakeCli
     measured.wait_text(f"2 trees are chosen; only tree {second} is corrected here")
     measured.set("Height (m)", 2.0)
     measured.press("Measure at this height")
-    measured.wait_text("Breast height")
-    assert studio.session.document.record(second).correction("breast_height") == 2.0
+    measured.wait(lambda _: studio.session.document.record(second).correction("breast_height") == 2.0)
     assert not studio.session.document.record(first).corrections
 
 

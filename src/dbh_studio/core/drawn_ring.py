@@ -22,11 +22,11 @@ from dbh_studio.settings import MeasureSettings
 DRAWN = "drawn"
 """What the curve is called in tables."""
 
-_SAME_PLANE_M = 0.02
-_PICTURE_M = 0.15
-_NEAR_M, _NEAR_SHARE = 0.01, 0.08
-_AWAY_M = 0.05
-_COARSE = 0.005
+_SAME_PLANE_M = 0.02  # a ring drawn in the picture of a section lies in its plane but for rounding
+_PICTURE_M = 0.15  # of stem to either side, as in the other methods' sections
+_NEAR_M, _NEAR_SHARE = 0.01, 0.08  # noise, and share of the radius a hand may be off by: points so near support it
+_AWAY_M = 0.05  # from breast height, as `not_at_height` elsewhere
+_COARSE = 0.005  # too thin by its corners, relative, from which on it is said: fewer than 19
 _REDRAW = "Draw the ring again, once around the stem."
 
 

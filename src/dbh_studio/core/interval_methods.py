@@ -122,7 +122,8 @@ def _estimate(
         flags=tuple(flag.words for flag in flags),
         position_m=result.position_m,
         flag_codes=tuple(flag.code for flag in flags),
-        taper_cm_per_m=result.taper_cm_per_m,
+        # Of a stretch too short to show it, or about an axis that was assumed, it is the prior's and no measurement.
+        taper_cm_per_m=result.taper_cm_per_m if section.axis_source == "stem" else None,
         rings=result.rings,
     )
 
@@ -146,7 +147,6 @@ def _section(
     radius = 0.01 * 0.5 * result.diameters["area"].value_cm
     error = np.abs(np.hypot(uv[:, 0], uv[:, 1]) - radius)
     gate = settings.ring_gate * radius + settings.ransac_tolerance_m if settings.ring_gate else np.inf
-    is_short = any(flag.code == "short_stretch" for flag in result.flags)
     return CrossSection(
         readonly(uv),
         readonly(chosen),
@@ -154,12 +154,19 @@ def _section(
         (options.breast_height_m + low, options.breast_height_m + high),
         options.breast_height_m,
         result.lean_deg,
-        "prior" if is_short else "stem",
+        _axis_source(result, options),
         result.arc_deg,
         result.gap_deg,
         radius,
         readonly(error < gate),
     )
+
+
+def _axis_source(result: EstimatorResult, options: EstimatorSettings) -> str:
+    """How the axis was found, as `CrossSection.axis_source` has it."""
+    if options.axis == "vertical":
+        return "vertical"
+    return "prior" if any(flag.code == "short_stretch" for flag in result.flags) else "stem"
 
 
 def _as_fit(name: str, result: EstimatorResult, uv_m: Float64) -> CurveFit:

@@ -160,7 +160,8 @@ class DbhEstimate:
         flags: What to look at, in plain words; empty where nothing stands out.
         position_m: (3,) centre of the ring in the stem's frame.
         flag_codes: Short names of the flags, in their order; see `Flag`.
-        taper_cm_per_m: Loss of diameter per metre of stem; None where too little of the stem was seen.
+        taper_cm_per_m: Loss of diameter per metre of stem; None where too little of the stem was seen, or its axis was
+            taken as vertical.
         rings: The stems in the section, the one measured first; empty for the paper's curves.
     """
 

@@ -21,14 +21,14 @@ STEP_M = 0.10
 LOWEST_M = 0.25
 """Below is litter, and the segmentation cuts there."""
 
-_MOST_POINTS = 2500
+_MOST_POINTS = 2500  # as many as the estimator looks at
 _LEAST_POINTS = 20
-_N_SECTORS, _LEAST_SECTORS = 12, 3
-_GATE = (0.4, 2.2)
+_N_SECTORS, _LEAST_SECTORS = 12, 3  # with less than 90° a size and a shift cannot be told apart
+_GATE = (0.4, 2.2)  # times the outline: nearer to the axis and farther from it nothing is taken for bark
 _ROUNDS = 4
 _ODD = (2654435761, 2246822519, 3266489917, 668265263)
 _N_EFFECTIVE = 30.0  # neighbouring points share their error
-_AXIS_SD_M, _AXIS_SD_SLOPE = 0.01, 0.03
+_AXIS_SD_M, _AXIS_SD_SLOPE = 0.01, 0.03  # of where the axis passes the section, and more with each metre from it
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,13 +22,12 @@ from dbh_studio.core.swelling import flag_of, own_sd
 from dbh_studio.settings import MeasureSettings
 
 STEP_M = 0.10
-_HALF_M = 0.25
-_LOWEST_M = 0.3
+_HALF_M = 0.25  # of stem to either side of a height
+_LOWEST_M = 0.3  # the segmentation cuts there
 _LEAST_POINTS = 25
-_LEAST_OTHERS = 4
+_LEAST_OTHERS = 4  # diameters, from both sides, to put a line through
 _NEAR_M = 1.0
-_TOO_FAR = 2.0
-_AT_LEAST = 0.04
+_TOO_FAR, _AT_LEAST = 2.0, 0.04  # standard deviations, and relative: as of the flag by slabs, `swelling.profile_flag`
 
 
 @dataclass(frozen=True)

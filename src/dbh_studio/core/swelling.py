@@ -16,20 +16,20 @@ from dbh_studio.core.arrays import Float64
 from dbh_studio.core.measured import Diameter, Flag
 from dbh_studio.core.stem_course import STEP_M, StemCourse
 
-_HERE_M = 0.11
-_BESIDE_M, _NEAR_M = 0.20, 1.05
-_LEAST_BESIDE = 3
-_LEAST_OTHERS = 6
-_AT_LEAST = 0.04
-_TOO_FAR = 2.0
-_SLOPE_M = 0.40
+_HERE_M = 0.11  # to either side of a height are two or three slabs
+_BESIDE_M, _NEAR_M = 0.20, 1.05  # from a height the stem beside it begins and ends: clear of a whorl, and by like taper
+_LEAST_BESIDE, _LEAST_OTHERS = 3, 6  # slabs on each side, and in all: fewer, and one of them could turn the line
+_AT_LEAST = 0.04  # relative: what the slabs of a regular stem seen from one side may be off by (3 %) does not reach it
+_TOO_FAR = 2.0  # standard deviations
+_SLOPE_M = 0.40  # of stem to either side over which a slope is taken; 5 of those 8 slabs must be seen
 _LEAST_SLABS = 5
-_REGULAR_M = 0.60
-_SCATTER = 0.015
-_WIDENING = 0.05
+_REGULAR_M = 0.60  # of stem above a swelling must be regular: a shorter piece may be a hollow in it
+_SCATTER = 0.015  # about the line of a regular stem, relative
+_WIDENING = 0.05  # relative per metre: stems do not thicken upwards, but slopes have errors
 # Diameter lost per metre: stems lose up to 3 cm, thick ones in proportion; more than that is a root swell.
 _TAPER_M, _TAPER_SHARE = 0.03, 0.08
 _USUAL_TAPER_M = 0.02
+# A slab, since a bulge's end is known to one; FAO's distance.
 _CLEAR_M = {"bulge": STEP_M, "buttress": 0.30}
 
 

@@ -14,7 +14,7 @@ from dbh_studio.core.dbh import DbhEstimate, Refusal, measure_stem
 from dbh_studio.core.drawn_ring import drawn_diameter
 from dbh_studio.core.ground import GroundKind, GroundModel
 from dbh_studio.core.progress import Progress, ignore_progress
-from dbh_studio.core.protocol_measure import measure_by_protocol
+from dbh_studio.core.protocol_measure import along_the_stem, measure_by_protocol
 from dbh_studio.core.protocols import Protocol
 from dbh_studio.core.stem_profile import ProfilePoint, stem_profile
 from dbh_studio.core.trunks import Trunk, TrunkSet
@@ -91,7 +91,8 @@ def measure_trunk(
     )
     if ring_m is not None:
         ring = np.asarray(above(ring_m, at.z_m), np.float64)
-        result = drawn_diameter(ring, stem, result, axis=at.axis, settings=settings, ground_note=at.note)
+        wanted = along_the_stem(stem, settings)
+        result = drawn_diameter(ring, stem, result, axis=at.axis, settings=wanted, ground_note=at.note)
     centre = result.position_m if isinstance(result, DbhEstimate) else at.axis.point_m
     protocol = Protocol.of(settings, base=at.base)
     return StemMeasurement(trunk_id, result, readonly(centre[:2].copy()), at.z_m, len(points), ground.kind, protocol)

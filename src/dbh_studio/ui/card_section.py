@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 class Compared:
     """One tree looked at more closely, as it is measured in one way."""
 
+    document: Document
     measured: StemMeasurement
     result: DbhEstimate | Refusal
     profile: tuple[ProfilePoint, ...]
@@ -59,7 +60,7 @@ class CardSection(Section):
         if stem is None:
             set_content(self._card, tree_card.waiting_card(selected))
             return
-        compared = self.compared(stem)
+        compared = self.compared(document, stem)
         result, profile = stem.result, ""
         if compared is not None:
             result = compared.result
@@ -83,10 +84,12 @@ class CardSection(Section):
         card = tree_card.tree_card(selected, result, section=picture + profile, scale=scale, said=said, actions=actions)
         set_content(self._card, card + flag_html(selected, record.flag))
 
-    def compared(self, stem: StemMeasurement) -> Compared | None:
-        """What was found on looking more closely at a tree, if it is still measured so."""
+    def compared(self, document: Document, stem: StemMeasurement) -> Compared | None:
+        """What was found on looking more closely at a tree, if it is still so: a note about it changes nothing."""
         found = self._compared
-        return found if found is not None and found.measured is stem else None
+        if found is None or found.measured.trunk_id != stem.trunk_id:
+            return None
+        return found if found.document is document or found.measured is stem else None
 
     def _compare(self, _: Any = None) -> None:
         """Measure the chosen tree by every method and all along the stem, for the pictures."""
@@ -105,7 +108,7 @@ class CardSection(Section):
             flag = breast_height_flag(profile, height_m, result.diameters[result.definition], scale_sd=scale_sd)
             if flag is not None:
                 result = replace(result, flags=(*result.flags, flag.words), flag_codes=(*result.flag_codes, flag.code))
-        self._compared = Compared(stem, result, profile, height_m)
+        self._compared = Compared(document, stem, result, profile, height_m)
         self.refresh()
 
 

@@ -264,6 +264,8 @@ window.dbhEdit = window.dbhEdit || (() => {
     if (!state || isTyping(e)) return;
     if (e.key === 'Escape' && stroke) { e.stopImmediatePropagation(); stop(); return; }
     if (e.key === 'Escape' && !keys.hidden) { e.stopImmediatePropagation(); keys.hidden = true; return; }
+    // Held down it repeats itself: the points would go, and then the trunk that they were taken off.
+    if (e.key === 'Delete' && e.repeat) { e.stopImmediatePropagation(); e.preventDefault(); return; }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     const what = {'[': 'narrower', ']': 'wider', '+': 'grow', '=': 'grow', '-': 'shrink', '\u2212': 'shrink'}[e.key];
     if (!what || ((what === 'narrower' || what === 'wider') && state.tool !== 'brush')) return;

@@ -57,11 +57,12 @@ class ReviewSection(Section):
 
     def refresh(self) -> None:
         """Show how far one is."""
-        queue = self.queue()
-        set_visible(self._bar, bool(queue))
-        if queue:
+        session, queue = self.tab.session, self.queue()
+        n_waiting = len(session.unmeasured()) if session is not None else 0
+        is_there = bool(queue) or n_waiting > 0  # while all are measured again, too: the table below must not jump
+        set_visible(self._bar, is_there)
+        if is_there:
             view = self.tab.view
-            n_waiting = len(self._known[2]) if self._known is not None else 0
             progress = review_progress(queue, n_waiting=n_waiting)
             bar = review_bar(progress, view.review_filter, is_worst_first=view.sort_column == "worst")
             set_content(self._bar, bar)
@@ -143,7 +144,8 @@ class ReviewSection(Section):
         if not ids:
             raise CommandError("No tree is left that may be accepted without looking at it.")
         session.do(commands.review_trees(decided(session, ids, "accepted")))
-        self.tab.worker.notify(f"{len(ids)} trees accepted", "Good ones, with nothing to look at. Undo takes it back.")
+        trees = "1 tree" if len(ids) == 1 else f"{len(ids)} trees"
+        self.tab.worker.notify(f"{trees} accepted", "Good ones, with nothing to look at. Undo takes it back.")
 
     def _review_pressed(self, payload: Any) -> None:
         if payload == "accept":

@@ -18,6 +18,16 @@ from dbh_studio.core.estimator.heap import HeapSigns, heap_signs_of
 from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
 from dbh_studio.core.estimator.posterior import N_OUTLINE, Patches, Posterior, patches_of, posterior_of
 from dbh_studio.core.estimator.prior import StemPrior
+from dbh_studio.core.estimator.refusals import (
+    clutter,
+    implausible,
+    no_ring,
+    no_surface,
+    too_few,
+    too_shallow,
+    too_uncertain,
+    two_rings,
+)
 from dbh_studio.core.estimator.result import EstimatorResult
 from dbh_studio.core.estimator.ring_count import MOST_STEMS, OtherStem, Stems, first_of, stems_of
 from dbh_studio.core.estimator.sample import sample_points
@@ -30,8 +40,6 @@ from dbh_studio.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
 _SURE_RING = 0.05  # standard deviation of a ring's points, relative to its radius, where none is told
-_LOOK = "Look at the stem: remove what is not bark, or delete it if it is no tree."
-_REMEDY = "Record the stem from its other side, or enter a tape value."
 
 
 def estimate_diameter(
@@ -104,10 +112,10 @@ def assess_stem(
     seed = settings.seed if seed is None else seed
     used, heights = _window(points, settings)
     if len(used) < settings.min_points:
-        return Assessment(None, _too_few(heights, len(used), settings))
+        return Assessment(None, too_few(heights, len(used), _stretch(settings), settings))
     local, origin = _local(used, settings, seed)
     stems = _stems(local, origin, line, settings, seed)
-    found = _no_ring(local, settings) if stems is None else _fitted(stems, settings, seed)
+    found = no_ring(len(local), settings) if stems is None else _fitted(stems, settings, seed)
     if isinstance(found, Refusal):
         return Assessment(None, found)
     return _judged(found, origin, settings, _Told(scale_sd, drift_m))
@@ -188,7 +196,7 @@ def _stems(
     if line is None or line.ring is None:
         return _started(local, settings, seed)
     first = _start_at(line, line.ring, origin)
-    return stems_of(local, first, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed)
+    return stems_of(local, first, widest_m=settings.max_diameter_cm / 200.0, seed=seed)
 
 
 def _started(local: Float64, settings: EstimatorSettings, seed: int, *, most: int = MOST_STEMS) -> Stems | None:
@@ -197,7 +205,7 @@ def _started(local: Float64, settings: EstimatorSettings, seed: int, *, most: in
     found = search_rings(local, widest_m=widest_m, taper=settings.taper, rng=rng)
     if not len(found.rings.radius):
         return None
-    return stems_of(local, first_of(found), widest_m=widest_m, seed=settings.seed, most=most)
+    return stems_of(local, first_of(found), widest_m=widest_m, seed=seed, most=most)
 
 
 def _start_at(line: StemAxis, ring: Circle, origin: Float64) -> Tube:
@@ -236,15 +244,13 @@ def _fitted(stems: Stems, settings: EstimatorSettings, seed: int) -> _Found | Re
             # A second stem may have been taken for a bulge of this one: a circle does not reach round both.
             circle = _by("circle", stems, prior, settings, seed)
             if circle is not None:
-                more = stems_of(
-                    stems.points, circle.tube, widest_m=settings.max_diameter_cm / 200.0, seed=settings.seed
-                ).others
+                more = stems_of(stems.points, circle.tube, widest_m=settings.max_diameter_cm / 200.0, seed=seed).others
                 if more:
                     return replace(circle, others=(*stems.others, *more))
         if found is not None:
             return found
     found = _by("circle", stems, prior, settings, seed)
-    return _no_ring(stems.points, settings) if found is None else found
+    return no_ring(len(stems.points), settings) if found is None else found
 
 
 def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings, seed: int) -> _Found | None:
@@ -285,20 +291,18 @@ def _refusal(
 ) -> Refusal | None:
     """Why a result may not be given; None where it may."""
     if found.evidence.is_heap(is_askew=found.method == "circle" and settings.axis == "vertical"):
-        return _no_surface(settings)
+        return no_surface(settings)
     if found.signs is not None and found.signs.chance > settings.max_clutter:
-        return _clutter(found.signs, settings)
+        return clutter(found.signs, settings)
     if any(each.may_be_meant for each in found.others):
-        return _two_rings(found, settings)
+        return two_rings(found.tube, found.others, settings)
     if spread.depth_noise > settings.max_depth_noise:
-        return _too_shallow(found, spread)
+        return too_shallow(found.evidence, spread.sigma_m)
     if not settings.min_diameter_cm <= chosen.value_cm <= settings.max_diameter_cm:
-        limits = f"{settings.min_diameter_cm:g} to {settings.max_diameter_cm:g} cm"
-        reason = f"The ring is {chosen.value_cm:.1f} cm thick, outside {limits}."
-        return Refusal("implausible", reason, "Check the scale of the cloud; if it is right, change the limits.")
+        return implausible(chosen, settings)
     is_wide = CALIBRATIONS[found.method].factor * log_sd > settings.max_half_width
     if is_wide or found.evidence.arc_deg < settings.min_arc_deg:
-        return _too_uncertain(found.evidence, chosen)
+        return too_uncertain(found.evidence, chosen)
     return None
 
 
@@ -382,75 +386,3 @@ def _diameter(log_m: float, calibration: Calibration, spread: Spread, told: _Tol
 def _moved_to(logs: tuple[float, float, float], middle: float) -> tuple[float, float, float]:
     shift = middle - logs[1]
     return logs[0] + shift, logs[1] + shift, logs[2] + shift
-
-
-def _too_few(heights_m: Float64, n_used: int, settings: EstimatorSettings) -> Refusal:
-    low, high = _stretch(settings)
-    if not len(heights_m):
-        return Refusal("no_points", "The stem has no points.", "Segment the plot again, or add points by hand.")
-    if n_used:
-        reason = (
-            f"Only {n_used} points between {low:.2f} and {high:.2f} m above ground; {settings.min_points} are needed."
-        )
-        return Refusal("too_few_points", reason, "Record the stem from nearer, or enter a tape value.")
-    lowest, highest = np.quantile(heights_m, [0.01, 0.99])
-    return Refusal(
-        "no_band",
-        f"No points between {low:.2f} and {high:.2f} m above ground; they lie from {lowest:.2f} to {highest:.2f} m.",
-        "Check the ground and the scale; if they are right, set another breast height.",
-    )
-
-
-def _no_ring(local: Float64, settings: EstimatorSettings) -> Refusal:
-    return Refusal(
-        "no_ring",
-        f"The {len(local)} points about {settings.breast_height_m:.2f} m above ground do not form a ring.",
-        _LOOK,
-    )
-
-
-def _no_surface(settings: EstimatorSettings) -> Refusal:
-    """Why a heap of points has no diameter, though some ring can be laid through any."""
-    return Refusal(
-        "no_ring",
-        f"The points about {settings.breast_height_m:.2f} m above ground fill the place evenly; no ring stands out.",
-        _LOOK,
-    )
-
-
-def _clutter(signs: HeapSigns, settings: EstimatorSettings) -> Refusal:
-    """Why what has a ring, but is none of bark, has no diameter."""
-    return Refusal(
-        "clutter",
-        f"What is {settings.breast_height_m:.2f} m above ground looks like a shrub, a heap or a thing: {signs.words}.",
-        "Delete it if it is no tree; if it is one, remove what is not bark, or enter a tape value.",
-    )
-
-
-def _two_rings(found: _Found, settings: EstimatorSettings) -> Refusal:
-    """Why a section in which no one ring is clearly the stem meant has no diameter."""
-    sizes = sorted((200.0 * tube.radius for tube in (found.tube, *(each.tube for each in found.others))), reverse=True)
-    said = ", ".join(f"{size:.0f}" for size in sizes[:-1]) + f" and {sizes[-1]:.0f} cm"
-    where = f"at {settings.breast_height_m:.2f} m above ground"
-    if any(each.kind == "fork" for each in found.others):
-        reason = f"The stem forks below: {len(sizes)} rings {where}, about {said} thick."
-        return Refusal("two_rings", reason, "Split it by stems and measure each, or measure below the fork.")
-    reason = f"{len(sizes)} rings {where}, about {said} thick; none of them is clearly the stem meant."
-    return Refusal("two_rings", reason, "Split it by stems, or remove the points of the other one.")
-
-
-def _too_uncertain(evidence: Evidence, chosen: Diameter) -> Refusal:
-    between = f"anything from {chosen.low_cm:.0f} to {chosen.high_cm:.0f} cm would agree with the points"
-    if evidence.gap_deg >= 120.0:
-        return Refusal("small_arc", f"Only {evidence.arc_deg:.0f}° of the ring seen: {between}.", _REMEDY)
-    return Refusal("too_uncertain", f"The points are too few or too scattered; {between}.", _REMEDY)
-
-
-def _too_shallow(found: _Found, spread: Spread) -> Refusal:
-    """Why an arc that is hardly deeper than its noise has no diameter: any curvature would agree with it."""
-    scatter = f"the points scatter by {1000 * spread.sigma_m:.0f} mm"
-    if found.evidence.gap_deg >= 120.0:
-        seen = f"Only {found.evidence.arc_deg:.0f}° of the ring seen and {scatter}"
-        return Refusal("small_arc", f"{seen}: many diameters would agree with that.", _REMEDY)
-    remedy = "Record the stem from nearer, or enter a tape value."
-    return Refusal("too_uncertain", f"The stem is too thin for its points: {scatter}.", remedy)

@@ -89,7 +89,7 @@ class InspectPanel(Panel):
         document = session.document
         queue = {entry.tree_id: (rank, entry) for rank, entry in enumerate(self.review.queue())}
         waiting, rows = set(session.unmeasured(document)), []
-        is_all = self.tab.view.review_filter == "all"
+        is_all = self.tab.view.review_filter == "all" or not queue  # without a queue there is nothing to press
         for trunk_id in document.trunks.ids:
             if trunk_id in waiting:
                 rows.append(TableRow(trunk_id, None, "", None, "not measured yet", rank=len(queue)))
