@@ -51,7 +51,7 @@ METHODS = ("shrinkage", "circle", "fourier", "ellipse", "bspline")
 
 
 def every_method(folder: Path, options: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Diameters in cm by method and stem number, of the plot that a run left in a folder; NaN where refused."""
+    """Diameters in cm by method and stem number, of the plot that a run left in a folder; NaN where it gives none."""
     (plot,) = folder.glob("*.dbh")
     table = folder / "methods.csv"
     command = [*program_command(options.program), "measure", str(plot), "--csv", str(table), "--quiet"]
@@ -61,10 +61,7 @@ def every_method(folder: Path, options: argparse.Namespace) -> dict[str, dict[st
         sys.exit(f"Measuring by every method ended with {outcome.exit_code}:\n{outcome.output[-2000:]}")
     with table.open(encoding="utf-8-sig", newline="") as file:
         rows = list(csv.DictReader(file))
-    return {
-        method: {row["stem_id"]: float(row[f"{method}_cm"] or "nan") for row in rows if row["quality"] != "refused"}
-        for method in METHODS
-    }
+    return {method: {row["stem_id"]: float(row[f"{method}_cm"] or "nan") for row in rows} for method in METHODS}
 
 
 def method_table(found: Table, by_method: dict[str, dict[str, float]], data: Path) -> str:

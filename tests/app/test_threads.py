@@ -134,3 +134,9 @@ def test_an_error_within_gives_the_call_up_and_its_own_error_comes_out_of_it():
     ahead.begin(fails)
     with pytest.raises(ValueError, match="no points"):
         ahead.call(fails, progress=ignore_progress)
+
+
+def test_small_items_are_done_here():
+    here = threading.get_ident()
+    assert set(map_in_threads(lambda _: threading.get_ident(), range(8), size=3_000)) == {here}
+    assert here not in set(map_in_threads(lambda _: threading.get_ident(), range(8), size=1e6))

@@ -261,7 +261,9 @@ class Derived:
         ids = document.trunks.ids
         missing = [i for i in ids if self.known_measurement(document, i) is None] if document.scale.is_known else []
         progress(0.0, "Measuring the stems")
-        for n_done, _ in enumerate(map_in_threads(lambda i: self.measurement(document, i), missing), start=1):
+        size = sum(len(document.trunks[i]) for i in missing) / max(len(missing), 1)
+        measured = map_in_threads(lambda i: self.measurement(document, i), missing, size=size)
+        for n_done, _ in enumerate(measured, start=1):
             progress(n_done / len(missing), f"Measured {n_done} of {len(missing)} stems")
         progress(1.0, "")
         return tuple(self.measurement(document, i) for i in ids)

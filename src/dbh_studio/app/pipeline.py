@@ -239,7 +239,8 @@ def measure_stems(
 
     measured: list[StemMeasurement] = []
     progress(0.0, "Measuring the stems")
-    for stem in map_in_threads(measure, stems):
+    size = sum(len(points) for _, points, _ in stems) / max(len(stems), 1)
+    for stem in map_in_threads(measure, stems, size=size):
         measured.append(stem)
         progress(len(measured) / len(stems), f"Measured {len(measured)} of {len(stems)} stems")
     progress(1.0, "")

@@ -23,14 +23,24 @@ Value = TypeVar("Value")
 
 _N_THREADS = 2
 _N_AHEAD = 4  # so that a thread that is early finds work
+# Short calls of numpy keep the interpreter's lock: stems of 3 000 points were measured 1.3 times slower by two threads
+# than by one, stems of 50 000 points 1.5 times quicker.
+_LEAST_POINTS = 15_000
 
 
-def map_in_threads(function: Callable[[Item], Value], items: Sequence[Item]) -> Iterator[Value]:
+def map_in_threads(
+    function: Callable[[Item], Value], items: Sequence[Item], *, size: float = np.inf
+) -> Iterator[Value]:
     """``function(item)`` of every item, in their order; `function` must be safe to call from several threads.
+
+    Args:
+        function: What is done.
+        items: To what.
+        size: How many points an item has, about: with few, it is done here, one after another.
 
     Where the caller stops listening, or a call raises, no more than the few calls under way are finished.
     """
-    if len(items) < 2:
+    if len(items) < 2 or size < _LEAST_POINTS:
         yield from map(function, items)
         return
     with ThreadPoolExecutor(_N_THREADS) as pool:

@@ -54,8 +54,13 @@ class MeasuringSection(Section):
         self._change("Change how diameters are measured", **self._form.read().model_dump())
 
     def _curve_chosen(self, curve: Any) -> None:
-        if curve in get_args(CurveName):
+        if curve in get_args(CurveName) and curve != self.tab.settings().measure.curve:
             self._change(f"Measure by: {CURVE_TITLES[curve]}", curve=curve)
+            # The buttons stand in the card of one tree.
+            self.tab.worker.notify(
+                f"Every tree is measured by {CURVE_TITLES[curve]} now",
+                "Undo takes it back. For one tree alone: Correct this measurement, Method of this tree.",
+            )
 
     def _method_chosen(self, title: str) -> None:
         self._curve_chosen(next(name for name, known in CURVE_TITLES.items() if known == title))

@@ -90,8 +90,10 @@ def _card_facts(result: DbhEstimate) -> list[tuple[str, str]]:
         ("Measured at", f"{cut.hom_m:.2f} m"),
         ("Tape round it", _in_brackets(round_cm) + " cm"),
         ("Ring seen", f"{cut.coverage_deg:.0f}°, largest gap {cut.max_gap_deg:.0f}°"),
-        ("Lean", f"{cut.lean_deg:.0f}°"),
     ]
+    # An assumed axis tells nothing about the lean.
+    if cut.axis_source == "stem":
+        pairs.append(("Lean", f"{cut.lean_deg:.0f}°"))
     if result.taper_cm_per_m is not None:
         pairs.append(("Taper", f"{result.taper_cm_per_m:.1f} cm per metre"))
     return pairs
@@ -101,12 +103,13 @@ def _measuring_facts(result: DbhEstimate, scale: str) -> list[tuple[str, str]]:
     """How the diameter was read, and what it would be by another definition."""
     low, high = result.section.band_m
     method = "Ring drawn by hand" if result.curve == DRAWN else CURVE_TITLES.get(result.curve, result.curve)
+    scatter = f"{result.rmse_mm:.1f} mm about the curve, " if np.isfinite(result.rmse_mm) else ""
     others = [f"{DEFINITION_TITLES[name]} {_with_range(diameter)}" for name, diameter in result.diameters.items()]
     return [
         ("Read from", f"{method}, {_definition(result)}"),
         ("Interval", f"90 %{scale}" if result.interval else "none: this method has none that is honest"),
         ("By definition", ", ".join(others)),
-        ("Scatter", f"{result.rmse_mm:.1f} mm about the curve, {result.n_points:,} points"),
+        ("Scatter", f"{scatter}{result.n_points:,} points"),
         ("Shown", f"the stretch from {low:.2f} to {high:.2f} m"),
     ]
 
