@@ -43,9 +43,8 @@ def main() -> None:
         each.append(1000 * (time.thread_time() - begun))
     size = np.mean([len(points) for _, points, _ in stems])
     print(f"{options.n} stems of {size:,.0f} points on average: {seconds:.1f} s")
-    print(
-        f"one stem, one core: median {np.median(each):.1f} ms, 95 % {np.quantile(each, 0.95):.1f}, mean {np.mean(each):.1f}"
-    )
+    high = np.quantile(each, 0.95)
+    print(f"one stem, one core: median {np.median(each):.1f} ms, 95 % {high:.1f}, mean {np.mean(each):.1f}")
 
 
 if __name__ == "__main__":
