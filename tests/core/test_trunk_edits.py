@@ -7,7 +7,7 @@ import pytest
 from tests.app.plots import trunk
 
 from dbh_studio.core.picking import PickCloud, View
-from dbh_studio.core.trunk_edits import beyond_plane, grown, owners, plane_of_line, shrunk
+from dbh_studio.core.trunk_edits import beyond_plane, grown, in_order, owners, plane_of_line, shrunk
 
 FAR = np.array([500_000.0, 4_500_000.0, 100.0])
 
@@ -88,3 +88,13 @@ def test_a_ball_holds_what_is_within_its_radius():
     sure = np.flatnonzero(gap < 0.2499)
     assert np.isin(sure, inside).all() and (gap[inside] < 0.2501).all() and len(inside) > 1000
     assert (np.diff(inside) > 0).all()
+
+
+def test_indices_of_all_parts_stand_in_order_and_once():
+    rng = np.random.default_rng(0)
+    parts = [rng.integers(0, 5000, n) for n in (0, 1, 700, 900)]
+    found = in_order(*parts)
+    assert found.dtype == np.int32
+    assert np.array_equal(found, np.unique(np.concatenate(parts)))
+    assert np.array_equal(in_order(found), found)
+    assert len(in_order()) == len(in_order([])) == 0

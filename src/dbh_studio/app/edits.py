@@ -17,7 +17,7 @@ from dbh_studio.app.commands import Command, existing_trunk
 from dbh_studio.app.document import Document
 from dbh_studio.core.arrays import Int32
 from dbh_studio.core.inventory import TreeRecord
-from dbh_studio.core.trunk_edits import owners
+from dbh_studio.core.trunk_edits import in_order, owners
 from dbh_studio.core.trunks import MAX_TRUNK_ID, Trunk, TrunkSet
 from dbh_studio.errors import CommandError
 
@@ -40,7 +40,7 @@ def merge_trunks(ids: Iterable[int], into: int | None = None) -> Command:
             raise CommandError("Two or more trunks are needed to merge.", "Choose the trunks that are one stem.")
         trunks = [existing_trunk(document, trunk_id) for trunk_id in wanted]
         target = document.trunks[kept]
-        points = np.unique(np.concatenate([trunk.points for trunk in trunks]))
+        points = in_order(*(trunk.points for trunk in trunks))
         after = document.trunks
         for trunk in trunks:
             after = after.without(trunk.id)
@@ -59,12 +59,13 @@ def split_trunk(trunk_id: int, parts: Sequence[NDArray[Any]]) -> Command:
         parts: Two or more disjoint sets of the trunk's points, indices into the cloud. Points in none of them are set
             free.
     """
-    pieces = [np.unique(np.asarray(part, np.int32)) for part in parts]
+    pieces = [in_order(part) for part in parts]
 
     def apply(document: Document) -> Document:
         trunk = existing_trunk(document, trunk_id)
-        together = np.concatenate(pieces) if pieces else np.empty(0, np.int32)
-        if len(np.unique(together)) != len(together) or not np.isin(together, trunk.points).all():
+        together = in_order(*pieces)
+        at = trunk.points.searchsorted(together).clip(0, len(trunk) - 1)
+        if len(together) != sum(map(len, pieces)) or not (trunk.points[at] == together).all():
             raise CommandError(
                 f"The parts are not parts of trunk {trunk_id} as it is now.", "It was changed meanwhile: cut it again."
             )
@@ -124,7 +125,7 @@ def assign_points(points: NDArray[Any], trunk_id: int) -> Command:
         if len(taken.pop(trunk_id, ())) == len(chosen):
             return document
         after, records = _taken_from(document, taken)
-        grown = Trunk(trunk_id, np.union1d(target.points, chosen).astype(np.int32), target.origin)
+        grown = Trunk(trunk_id, in_order(target.points, chosen), target.origin)
         records[trunk_id] = replace(document.record(trunk_id), edited=True)
         return _with(document, after.with_trunk(grown), records)
 
@@ -276,10 +277,10 @@ def _inside(document: Document, points: NDArray[Any]) -> Int32:
     Raises:
         CommandError: One is not of the cloud.
     """
-    chosen = np.unique(np.asarray(points, np.int64))
-    if len(chosen) and (chosen[0] < 0 or chosen[-1] >= document.source.n_points):
+    given = np.asarray(points, np.int64)
+    if len(given) and (given.min() < 0 or given.max() >= document.source.n_points):
         raise CommandError("Points were selected that are not in the cloud.", "Select them again.")
-    return chosen.astype(np.int32)
+    return in_order(given)
 
 
 def _minus(points: Int32, taken: Mapping[int, Int32]) -> Int32:
