@@ -313,7 +313,7 @@ def test_a_key_held_down_flies_once(measured: FakeClient, studio: Studio) -> Non
     standstill.end()
     measured.settle()
     moves = [m for m in measured.messages[n_before:] if m["type"] == "SetCameraPositionMessage"]
-    # Of moves that wait to be sent the later one goes in the place of the earlier: there may be few, but not 12 flights.
+    # Of moves that wait to be sent the last goes in the place of all: there may be few of them, but not 12 flights.
     assert 1 <= len(moves) <= 12 + 8
 
 
