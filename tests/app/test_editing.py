@@ -8,12 +8,10 @@ from tests.threestems import STEMS, plot_cloud, stem_points
 
 from dbh_studio.app import edits
 from dbh_studio.app.document import Document, SourceInfo
+from dbh_studio.app.edit_pool import pool_about, pool_of
 from dbh_studio.app.editing import (
     add_by_click,
     grow_trunk,
-    select_ball,
-    select_lasso,
-    select_rectangle,
     shrink_trunk,
     split_by_line,
     split_by_plane,
@@ -42,25 +40,21 @@ def session() -> Session:
 
 
 def test_a_selection_is_taken_among_all_points_or_within_a_trunk(session):
-    x, y, diameter = STEMS[0]
+    x, y, _ = STEMS[0]
     view = View.looking_at((x, y - 10, 2.0), (x, y, 2.0))
     around = np.array([[0.4, 0.0], [0.6, 0.0], [0.6, 1.0], [0.4, 1.0]])
-    everything = select_lasso(session, view, around)
-    own = select_lasso(session, view, around, within=[1])
+    document = session.document
+    everything = pool_about(session, document, 1).lasso(view, around)
+    own = pool_of(session, document, [1]).lasso(view, around)
     assert np.isin(own, FIRST).all() and len(own) > 11_000
     assert set(own) < set(everything) and (everything < 30_000).any()
-    same = select_rectangle(session, view, (0.4, 0.0), (0.6, 1.0), within=[1])
+    same = pool_of(session, document, [1]).rectangle(view, (0.4, 0.0), (0.6, 1.0))
     assert np.array_equal(same, own)
-    ball = select_ball(session, (x, y, 1.3), diameter, within=[1, 2])
-    assert np.isin(ball, FIRST).all() and len(ball) > 100
-    assert len(select_lasso(session, view, around, within=[])) == 0
-    for call in (
-        lambda: select_lasso(session, view, around, within=[9]),
-        lambda: select_ball(session, (0, 0, 0), 0.0),
-        lambda: select_ball(session, (0, 0, 0), float("nan")),
-    ):
-        with pytest.raises(CommandError):
-            call()
+    brushed = pool_of(session, document, [1, 2]).brushed(view, [(0.5, 0.5)], 0.2)
+    assert np.isin(brushed, FIRST).all() and len(brushed) > 100
+    assert len(pool_of(session, document, []).lasso(view, around)) == 0
+    with pytest.raises(CommandError):
+        pool_of(session, document, [9])
 
 
 def test_a_line_drawn_between_two_stems_parts_them(session):

@@ -7,7 +7,6 @@ import pytest
 from dbh_studio.app.section_edits import (
     drawn_points,
     drawn_polygon,
-    inside_polygon,
     moved_words,
     other_heights,
     ring_in_source,
@@ -15,6 +14,7 @@ from dbh_studio.app.section_edits import (
 )
 from dbh_studio.core.dbh import DbhEstimate
 from dbh_studio.core.measured import Diameter
+from dbh_studio.core.polygons import inside_polygon
 from dbh_studio.core.stem_profile import ProfilePoint
 from dbh_studio.errors import CommandError
 

@@ -22,6 +22,7 @@ from dbh_studio.app.session import Session
 from dbh_studio.core.arrays import Float32, Float64, Int32, Int64
 from dbh_studio.core.picking import PickCloud, View
 from dbh_studio.core.point_blocks import PointBlocks
+from dbh_studio.core.trunk_edits import in_order
 from dbh_studio.core.trunks import Trunk, TrunkSet
 
 _log = logging.getLogger(__name__)
@@ -107,7 +108,7 @@ def pool_of(session: Session, document: Document, ids: Iterable[int]) -> Pool:
         CommandError: One is not there.
     """
     own = [existing_trunk(document, trunk_id).points for trunk_id in sorted(set(ids))]
-    rows = np.sort(np.concatenate([*own, np.empty(0, np.int32)])).astype(np.int64)
+    rows = in_order(*own).astype(np.int64)
     return Pool(rows, session.points_world(document).take(rows, axis=0))
 
 

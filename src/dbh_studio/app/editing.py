@@ -1,16 +1,15 @@
-"""From what a person draws or clicks to points and edits: selections, cuts, growth, and a stem followed from a click.
+"""From what a person draws or clicks to edits: cuts, growth, and a stem followed from a click.
 
-Selections are taken among all points of the cloud, not among those on screen, and give indices into it. Cuts and growth
-give commands, computed for the plot as it is: send them with ``based_on``, so that a change meanwhile refuses them.
+They give commands, computed for the plot as it is: send them with ``based_on``, so that a change meanwhile refuses
+them. Points are chosen with `app.edit_pool`, among all of the cloud, not among those on screen.
 
-    points = select_lasso(session, view, polygon, within=[7])
+    points = pool_of(session, session.document, [7]).lasso(view, polygon)
     session.do(drop_points(points, 7))
     session.do(split_by_line(session, 7, view, (0.4, 0.2), (0.45, 0.9)))
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,9 @@ from dbh_studio.app.document import Document
 from dbh_studio.app.edit_pool import blocks_of
 from dbh_studio.app.edits import add_trunk, assign_points, keep_only, split_trunk
 from dbh_studio.app.session import Session
-from dbh_studio.core.arrays import Float32, Int64
+from dbh_studio.core.arrays import Int64
 from dbh_studio.core.dbh import Refusal
-from dbh_studio.core.picking import PickCloud, View
+from dbh_studio.core.picking import View
 from dbh_studio.core.trunk_edits import beyond_plane, grown, plane_of_line, shrunk
 from dbh_studio.core.trunks import Trunk
 from dbh_studio.errors import CommandError
@@ -30,38 +29,6 @@ from dbh_studio.settings import TrunkSettings
 
 # What a trunk grows or shrinks by at a press of a key, metres.
 STEP_M = 0.03
-
-
-def select_lasso(session: Session, view: View, polygon_xy: Any, *, within: Iterable[int] | None = None) -> Int64:
-    """(K,) sorted indices of the points that appear inside a polygon drawn on the screen, hidden ones too.
-
-    Args:
-        session: The plot.
-        view: The camera, in the world frame.
-        polygon_xy: (M, 2) screen positions 0..1.
-        within: Only points of these trunks; None takes all.
-    """
-    points, rows = _looked_at(session, within)
-    found = PickCloud.over(points).lasso(view, polygon_xy)
-    return found if rows is None else rows[found]
-
-
-def select_rectangle(
-    session: Session, view: View, lower_xy: Any, upper_xy: Any, *, within: Iterable[int] | None = None
-) -> Int64:
-    """As `select_lasso`, between two corners 0..1."""
-    points, rows = _looked_at(session, within)
-    found = PickCloud.over(points).rectangle(view, lower_xy, upper_xy)
-    return found if rows is None else rows[found]
-
-
-def select_ball(session: Session, centre_world: Any, radius_m: float, *, within: Iterable[int] | None = None) -> Int64:
-    """(K,) sorted indices of the points within `radius_m` of a place: the brush."""
-    if not (np.isfinite(radius_m) and radius_m > 0):
-        raise CommandError("The brush has no size.", "Choose a size above 0.")
-    points, rows = _looked_at(session, within)
-    found = PickCloud.over(points).ball(centre_world, radius_m)
-    return found if rows is None else rows[found]
 
 
 def split_by_line(session: Session, trunk_id: int, view: View, first_xy: Any, last_xy: Any) -> Command:
@@ -173,17 +140,6 @@ def shrink_trunk(session: Session, trunk_id: int, distance_m: float = STEP_M) ->
     if len(left) < 3:
         raise CommandError(f"Nothing of trunk {trunk_id} would be left.", "Shrink it by less, or delete it.")
     return keep_only(left, trunk_id)
-
-
-def _looked_at(session: Session, within: Iterable[int] | None) -> tuple[Float32, Int64 | None]:
-    """The points to select among, and their rows in the cloud; None where these are all of it."""
-    document = session.document
-    points = session.points_world(document)
-    if within is None:
-        return points, None
-    own = [existing_trunk(document, trunk_id).points for trunk_id in sorted(set(within))]
-    rows = np.sort(np.concatenate([*own, np.empty(0, np.int32)])).astype(np.int64)
-    return points[rows], rows
 
 
 def _owned(document: Document) -> np.ndarray:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from dbh_studio.app.commands import Command, with_records
 from dbh_studio.app.document import Document
 from dbh_studio.app.session import Session
-from dbh_studio.core.arrays import Bool, Float64, Int64
+from dbh_studio.core.arrays import Float64, Int64
 from dbh_studio.core.corrections import Correction, with_correction
 from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.core.polygons import inside_polygon
 from dbh_studio.core.section import CrossSection
 from dbh_studio.core.stem_profile import ProfilePoint
 from dbh_studio.errors import CommandError
@@ -51,7 +52,10 @@ def drawn_points(
     low, high = min(section.band_m[0], section.hom_m - _BELOW_M), max(section.band_m[1], section.hom_m + _ABOVE_M)
     there = (points[:, 2] >= low) & (points[:, 2] <= high)
     uv = section.stem_from_section.inverse().apply(points[there])[:, :2]
-    inside = inside_polygon(uv, np.asarray(polygon_uv_m, np.float64))
+    polygon = np.asarray(polygon_uv_m, np.float64)
+    if len(polygon) > _MOST_CORNERS:
+        polygon = polygon[np.linspace(0, len(polygon) - 1, _MOST_CORNERS).astype(int)]
+    inside = inside_polygon(uv, polygon)
     chosen = ~inside if keep else inside
     if not chosen.any():
         raise CommandError("No point of the section lies there.", "Draw round the points themselves.")
@@ -83,24 +87,6 @@ def ring_in_source(
 def in_source(document: Document, points_world: NDArray[Any]) -> Float64:
     """(N, 3) places of the source, units from the cloud's origin, of (N, 3) places of the world."""
     return np.asarray(document.world_from_source.inverse().apply(np.asarray(points_world, np.float64)), np.float64)
-
-
-def inside_polygon(uv: NDArray[np.floating[Any]], polygon: Float64) -> Bool:
-    """(N,) which of (N, 2) points are inside a closed polygon of (K, 2) corners; even-odd rule."""
-    if len(polygon) > _MOST_CORNERS:
-        polygon = polygon[np.linspace(0, len(polygon) - 1, _MOST_CORNERS).astype(int)]
-    low, high = polygon.min(axis=0), polygon.max(axis=0)
-    near = np.flatnonzero(((uv >= low) & (uv <= high)).all(axis=1))
-    u, v = uv[near, 0], uv[near, 1]
-    odd = np.zeros(len(near), bool)
-    for (u0, v0), (u1, v1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        if v0 == v1:
-            continue
-        crosses = (v0 > v) != (v1 > v)
-        odd ^= crosses & (u < u0 + (v - v0) * (u1 - u0) / (v1 - v0))
-    inside = np.zeros(len(uv), bool)
-    inside[near] = odd
-    return inside
 
 
 def drawn_polygon(payload: Any, *, at_least: int, at_most: int = 4000, largest_m: float = 50.0) -> Float64:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dbh_studio.core.arrays import Float64
+from dbh_studio.core.arrays import Bool, Float, Float64
 
 
 def signed_area(corners: Float64) -> float:
@@ -33,3 +33,17 @@ def crosses_itself(corners: Float64) -> bool:
         if meets.any() and (meets & (side(others, a[i]) * side(others, b[i]) < 0)).any():
             return True
     return False
+
+
+def inside_polygon(places: Float, corners: Float64) -> Bool:
+    """(N,) which of (N, 2) places are inside (M, 2) corners; where these cross, the even-odd rule. NaN is nowhere."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    near = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1))
+    x, y = places[near].T
+    odd = np.zeros(len(near), bool)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y0 != y1:
+            odd ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    inside = np.zeros(len(places), bool)
+    inside[near] = odd
+    return inside

@@ -17,7 +17,7 @@ import numpy as np
 
 from dbh_studio.core.arrays import Bool, Float64, readonly
 from dbh_studio.core.inventory import InventoryRow
-from dbh_studio.core.polygons import crosses_itself, signed_area
+from dbh_studio.core.polygons import crosses_itself, inside_polygon, signed_area
 
 Units = Literal["metric", "imperial"]
 Per = Literal["stem", "tree"]
@@ -110,13 +110,7 @@ class PlotArea:
         if self.outline_m is None:
             assert self.centre_m is not None and self.radius_m is not None
             return np.asarray(np.hypot(*(xy - self.centre_m).T) <= self.radius_m)
-        a, b = self.outline_m, np.roll(self.outline_m, -1, axis=0)
-        inside = np.zeros(len(xy), bool)
-        for (xa, ya), (xb, yb) in zip(a, b, strict=True):
-            crosses = (ya > xy[:, 1]) != (yb > xy[:, 1])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                inside ^= crosses & (xy[:, 0] < (xb - xa) * (xy[:, 1] - ya) / (yb - ya) + xa)
-        return inside
+        return inside_polygon(xy, self.outline_m)
 
 
 @dataclass(frozen=True)
