@@ -59,7 +59,7 @@ class PlotStatus:
             "trunks": "Press Find trunks.",
             "inspect": f"{self.n_trunks} trunks found{refused}. Click a trunk in the picture or a row in the table.",
             "export": f"{self.n_measured} of {self.n_trunks} trees measured, {self.n_reviewed} reviewed. "
-            + ("Export them." if self.n_reviewed >= self.n_trunks else "Space accepts a tree."),
+            + ("Export them." if self.n_reviewed >= self.n_trunks else "In step 4, Space accepts a tree."),
         }
         if self.done() >= set(STEP_TITLES):
             return "The inventory has been exported. Changes after that are not in the file."
