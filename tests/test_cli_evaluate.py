@@ -75,6 +75,71 @@ def test_from_two_tables_to_a_folder(tables, tmp_path, capsys):
     assert "| All | mine | 5 | 1.00 | 3.00 | 7.50 | 0.97 | 5.0 | – |" in report
 
 
+def test_names_mean_nothing_to_latex_and_markdown(tmp_path):
+    kinds = ("[5,10)", "<20 & 50%", "a_b|c", "*&amp;*")
+    field = tmp_path / "field.csv"
+    field.write_text("tree,dbh_cm,[seen]\n" + "".join(f'{k},{20 + k},"{kinds[k % 4]}"\n' for k in range(16)))
+    assert evaluate(field, field, "--by", "[seen]", "--out", tmp_path / "out") == EXIT_OK
+    text = (tmp_path / "out" / "table.tex").read_text()
+    assert text.startswith("% Needs \\usepackage{booktabs,multirow}.\n")
+    assert r"{[}seen{]}: \textless{}20 \& 50\% & field & 4 &" in text
+    assert r"{[}seen{]}: a\_b\textbar{}c & field & 4 &" in text
+    body = text.split("\\midrule", 1)[1].split("\\bottomrule")[0]
+    # Behind the end of a row a bracket or star would be taken for the row's own.
+    assert all(not line.startswith(("[", "*")) for line in body.splitlines())
+    assert body.count("{") == body.count("}")
+    markdown = (tmp_path / "out" / "table.md").read_text()
+    assert r"\[seen\]: \*&amp;amp;\*" in markdown and r"&lt;20 &amp; 50%" in markdown
+
+
+def test_a_table_against_itself_has_no_errors_and_its_figures_are_drawn(tables, tmp_path):
+    assert evaluate(tables[1], tables[1], "--out", tmp_path / "out") == EXIT_OK
+    first = rows(tmp_path / "out" / "table.csv")[0]
+    assert (first["median_bias_cm"], first["rmse_cm"], first["r_squared"]) == ("0.000", "0.000", "1.0000")
+    drawn = ET.parse(tmp_path / "out" / "relative_error.svg")
+    assert "nan" not in (tmp_path / "out" / "relative_error.svg").read_text() and len(list(drawn.iter())) > 10
+
+
+def test_a_folder_is_named_even_where_it_is_the_one_at_hand(tables, capsys):
+    assert evaluate(".", tables[1]) == EXIT_ERROR
+    assert ".: this is a folder" in capsys.readouterr().err
+
+
+def test_numbers_of_other_trees_are_doubted_and_places_tell_them_apart(tmp_path, capsys):
+    """Two tables of one stand, numbered each for itself."""
+    thick = [20, 35, 28, 41, 23, 52, 38, 31, 26, 45, 33, 24]
+    mine, field, placed = tmp_path / "mine.csv", tmp_path / "field.csv", tmp_path / "placed.csv"
+    mine.write_text("tree,dbh_cm\n" + "".join(f"{k},{d}\n" for k, d in enumerate(thick)))
+    field.write_text("tree,dbh_cm\n" + "".join(f"{(7 * k + 3) % 12},{d}\n" for k, d in enumerate(thick)))
+    assert evaluate(mine, field) == EXIT_OK
+    told = capsys.readouterr().out
+    assert "next to nothing to do with each other" in told and "columns x and y" in told
+    assert evaluate(mine, mine) == EXIT_OK
+    assert "next to nothing" not in capsys.readouterr().out
+    # Where places have told that the numbers are the same trees, a bad estimate is a bad estimate.
+    places = [(3.0 * k % 11, 7.0 * k % 13) for k in range(12)]
+    for path, shift in ((mine, 0), (placed, 3)):
+        rolled = thick[shift:] + thick[:shift]
+        path.write_text(
+            "tree,x,y,dbh_cm\n"
+            + "".join(f"{k},{x},{y},{d}\n" for k, ((x, y), d) in enumerate(zip(places, rolled, strict=True)))
+        )
+    assert evaluate(mine, placed) == EXIT_OK
+    assert "next to nothing" not in capsys.readouterr().out
+
+
+def test_stems_measured_from_their_own_files_go_by_their_names(tmp_path, capsys):
+    mine, field = tmp_path / "mine.csv", tmp_path / "field.csv"
+    heads = "file,stem_id,dbh_cm,dbh_definition,quality,reason\n"
+    mine.write_text(heads + "".join(f"cut/trunk_{k}.pcd,,{20 + k},tape,good,\n" for k in range(6)))
+    field.write_text("tree_id,file,dbh_cm\n" + "".join(f"{90 - k},trunk_{k}.pcd,{20 + k}\n" for k in range(6)))
+    assert evaluate(mine, field) == EXIT_OK
+    told = capsys.readouterr().out
+    assert "6/6" in told and "numbers from file instead" in told
+    # Not where the usual numbers fit, nor where somebody has said which they are.
+    assert evaluate(mine, field, "--reference-column", "id=tree_id") == EXIT_ERROR
+
+
 def test_latex_is_the_papers_table(tables, tmp_path):
     evaluate(*tables, tables[0], tables[1], "--out", tmp_path / "out")  # three inventories, the last the reference
     assert evaluate(tables[0], tables[0], tables[1], "--out", tmp_path / "out") == EXIT_OK

@@ -100,6 +100,25 @@ def test_measure_on_a_saved_plot_measures_each_stem_as_was_said_of_it(saved, cap
     assert (saved / "project.json").read_bytes() == before
 
 
+def test_the_table_of_a_plot_says_where_each_stem_stands(saved, capsys):
+    """Without that it cannot be compared with a field table that has numbers of its own."""
+    rows = measured(capsys, saved)
+    assert [(float(row["x_m"]), float(row["y_m"])) for row in rows] == [
+        pytest.approx((x, y), abs=4.5) for x, y, _ in STEMS
+    ]
+    apart = np.diff([[float(row["x_m"]), float(row["y_m"])] for row in rows], axis=0)
+    assert apart == pytest.approx(np.diff([[x, y] for x, y, _ in STEMS], axis=0), abs=0.02)
+
+
+def test_a_stem_that_is_refused_has_no_diameter_by_any_method(tmp_path, capsys):
+    points = stem_points(0.30)
+    points = points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < np.radians(25)]
+    write_las(tmp_path / "arc.las", PointCloud.from_points(points))
+    (row,) = measured(capsys, tmp_path / "arc.las")
+    assert row["quality"] == "refused" and row["remedy"]
+    assert [name for name, cell in row.items() if name.endswith("_cm") and cell] == []
+
+
 def test_the_profiles_of_a_saved_plot(saved, tmp_path, capsys):
     measured(capsys, saved, "--profile", tmp_path / "profile.csv")
     rows = table((tmp_path / "profile.csv").read_text())

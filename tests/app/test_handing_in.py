@@ -126,6 +126,27 @@ def test_the_ids_are_those_that_outlive_merging_and_splitting(plot, handed_in):
     assert float(rows[4]["dbh_cm"]) == pytest.approx(24.0, rel=0.02) and rows[4]["field_tape_cm"] == "24.20"
 
 
+def test_the_profile_has_every_stem_every_ten_centimetres_and_goes_through_its_diameter(handed_in):
+    rows = inventory_rows(handed_in)
+    with handed_in["profile"].open(newline="", encoding="utf-8") as file:
+        heights = list(csv.DictReader(file))
+    assert list(heights[0]) == [
+        "plot_id", "tree_id", "stem_id", "tag",
+        "height_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "coverage_deg", "reason",
+    ]  # fmt: skip
+    assert {int(row["stem_id"]) for row in heights} == set(rows)
+    for number, row in rows.items():
+        along = {float(h["height_m"]): h for h in heights if int(h["stem_id"]) == number}
+        apart = np.diff(sorted(along))
+        assert len(along) > 15 and apart == pytest.approx(np.full(len(apart), 0.1), abs=1e-9)
+        assert {(h["tree_id"], h["tag"]) for h in along.values()} == {(row["tree_id"], row["tag"])}
+        assert all(bool(h["dbh_cm"]) != bool(h["reason"]) for h in along.values())
+        if row["dbh_cm"]:
+            here = along[1.3]
+            assert float(here["dbh_cm"]) == pytest.approx(float(row["dbh_cm"]), rel=0.02)
+            assert float(here["dbh_lo_cm"]) < float(row["dbh_cm"]) < float(here["dbh_hi_cm"])
+
+
 def test_every_table_and_map_has_the_same_stems(handed_in):
     rows = inventory_rows(handed_in)
     for kind, layer in (("gpkg", None), ("geojson", None), ("xlsx", "Stems")):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -322,6 +323,21 @@ def test_a_wild_value_is_counted_at_the_edge_and_does_not_flatten_the_boxes():
     wild = Sample("a", "inv", "measured", estimated_cm=500.0, reference_cm=10.0)
     words = "".join(ET.fromstring(boxes_svg({"all": [*samples, wild]}, ["a"])).itertext())
     assert "1 more, up to 4900" in words
+
+
+def test_what_stands_under_many_boxes_does_not_run_into_one_another():
+    methods = [f"m{k}" for k in range(12)]
+    samples = [Sample(m, "t", "measured", estimated_cm=20.0 + k, reference_cm=20.0) for m in methods for k in range(4)]
+    samples += [Sample(m, "t", "measured", estimated_cm=900.0, reference_cm=20.0) for m in methods]
+    root = ET.fromstring(boxes_svg({"a": samples, "b": samples}, methods))
+    words = [(float(e.get("x")), e.get("y"), e.text) for e in root.iter() if (e.text or "").startswith(("n = ", "▲"))]
+    assert len(words) == 48
+    for line in {y for _, y, _ in words}:
+        at = sorted((x, text) for x, y, text in words if y == line)
+        # A letter of 11 px is 6 px wide, about.
+        assert all(b - a > 6.0 * len(text) for (a, text), (b, _) in itertools.pairwise(at))
+    width = float(root.get("viewBox").split()[2])
+    assert max(x for x, _, _ in words) < width
 
 
 def test_nothing_to_draw_is_a_picture_all_the_same():

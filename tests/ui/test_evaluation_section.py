@@ -61,6 +61,43 @@ def table_ids_of(tab: FakeClient) -> list[int]:
     return [int(number) for number in re.findall(r'data-pair="(\d+)"', tab.html())]
 
 
+def lines_of(tab: FakeClient) -> list[list[str]]:
+    """The cells of the table by kind of tree and method."""
+    rows = re.findall(r"<tr data-line=.*?</tr>", tab.html())
+    return [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in rows]
+
+
+def test_a_line_for_each_kind_of_tree_and_each_method(measured, field, tmp_path):
+    trees = plots.plot().trees
+    kinds = field.read_text().splitlines()
+    field.write_text("\n".join(f"{line},{'Side' if k == 0 else 'NS'[k % 2]}" for k, line in enumerate(kinds)))
+    compare(measured, field)
+    assert lines_of(measured) == []  # one line is the summary
+    # A column of the field table is there to be chosen once it was read; then no further press is needed.
+    measured.set("Tell apart by", "Side (field table)")
+    measured.wait(lambda t: len(lines_of(t)) == 3, LONG)
+    everything, north, south = lines_of(measured)
+    assert (everything[0], north[0], south[0]) == ("All", "N", "S")
+    assert int(north[1]) + int(south[1]) == int(everything[1]) == len(trees)
+    # Two trees or three: bias from three on.
+    assert all((row[2] == "–") == (int(row[1]) < 3) for row in (north, south))
+    assert everything[2] in measured.text()
+    measured.set("Every method", True)
+    measured.wait(lambda t: {"shrinkage", "circle", "fourier"} <= {row[1] for row in lines_of(t)}, LONG)
+    by_method = {row[1]: row for row in lines_of(measured) if row[0] == "All"}
+    assert by_method["shrinkage"][3:] == everything[2:]
+    assert all(int(row[2]) == len(trees) for row in by_method.values())
+    # The two with an interval say how often it holds the field value, the others do not.
+    assert by_method["circle"][-1].endswith(f"/{len(trees)}") and by_method["ellipse"][-1] == "–"
+    # What was chosen stays for the report.
+    assert measured.value("Tell apart by") == "Side (field table)"
+    measured.set("Report folder", "by side")
+    measured.press("Write the report")
+    measured.wait_notification("Report written", LONG)
+    assert (tmp_path / "by side" / "scatter_by_Side.svg").is_file()
+    assert "fourier" in (tmp_path / "by side" / "table.csv").read_text()
+
+
 def test_a_click_on_a_point_chooses_the_tree(measured, field):
     compare(measured, field)
     number = table_ids_of(measured)[0]

@@ -7,9 +7,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
 
 from dbh_studio import __version__
+from dbh_studio.core.arrays import Float64, readonly
 from dbh_studio.core.comparison import Comparison, Grouping, compare
 from dbh_studio.core.evaluation import ALL, Sample
 from dbh_studio.core.evaluation_figures import SectionPicture, boxes_svg, scatter_svg, sections_svg
@@ -27,13 +30,17 @@ from dbh_studio.io.evaluation_report import (
     table_markdown,
 )
 from dbh_studio.io.inventory_csv import check_not_source, inventory_csv
-from dbh_studio.io.table_columns import Reading, read_stem_table, stem_table_of
+from dbh_studio.io.table_columns import Reading, numbered_as_files, read_stem_table, stem_table_of
+from dbh_studio.settings import CurveName
 
 if TYPE_CHECKING:
+    from dbh_studio.app.document import Document
     from dbh_studio.app.session import Session
 
 _KIND = "dbh-studio evaluation"
 _RECORD = "evaluation.json"
+AS_MEASURED = "as measured"
+"""The plot's diameters where some of its trees have a method of their own."""
 _SECTIONS_SHOWN = 12
 _PAPERS_CURVES = ("fourier", "ellipse", "bspline")
 _MOST_PANELS = 24
@@ -52,6 +59,7 @@ class EvaluationRequest:
         reference_reading: How the reference is read.
         combine_stems: Join stems with one number into trees of √Σd², in all tables.
         pool: Take the inventories for samples of one thing rather than for rival methods.
+        every_method: Of the open plot: measure its stems by the other methods, too, and compare them all.
     """
 
     reference: Path
@@ -62,6 +70,7 @@ class EvaluationRequest:
     reference_reading: Reading = field(default_factory=Reading)
     combine_stems: bool = False
     pool: bool = False
+    every_method: bool = False
 
 
 def evaluate_files(request: EvaluationRequest) -> Comparison:
@@ -108,17 +117,57 @@ def evaluate_plot(session: Session, request: EvaluationRequest) -> Comparison:
     # Without fields of one's own: they may be called as anything that is looked for in a table.
     content = inventory_csv(replace(session.inventory(document=document), own=()))
     table = stem_table_of(content, request.inventory_reading, name=document.plot_id or "this plot")
-    return _compared([table], request)
+    return _compared([_with_methods(session, document, table) if request.every_method else table], request)
+
+
+def _with_methods(session: Session, document: Document, table: StemTable) -> StemTable:
+    """The table with the diameters by every other method; a stem that is refused has none by any."""
+    from dbh_studio.core.measured import CurveFit, DbhEstimate
+
+    n = len(table)
+    # Value and ends of the interval.
+    given: dict[str, Float64] = {name: np.full((n, 3), np.nan) for name in get_args(CurveName)}
+    for row, number in enumerate(table.cells["stem_id"]):
+        result = session.compared(int(number), document=document).result
+        if not isinstance(result, DbhEstimate):
+            continue
+        for name, fit in result.fits.items():
+            if isinstance(fit, CurveFit) and name in given:
+                diameter = fit.diameter(result.definition)
+                given[name][row] = [
+                    np.nan if v is None else v for v in (diameter.value_cm, diameter.low_cm, diameter.high_cm)
+                ]
+    main, curve = table.methods[0], document.settings.measure.curve
+    # What was chosen of single trees, or drawn by hand, is no other method's.
+    is_plain = set(table.cells["dbh_method"]) <= {"", curve}
+    first = curve if is_plain else AS_MEASURED
+    known = {name: v for name, v in given.items() if name != first and np.isfinite(v).any()}
+    diameters = {first: table.diameters_cm[main]} | {name: readonly(v[:, 0].copy()) for name, v in known.items()}
+    intervals = {first: table.intervals_cm[main]} if main in table.intervals_cm else {}
+    intervals |= {name: readonly(v[:, 1:].copy()) for name, v in known.items() if np.isfinite(v).all(axis=1).any()}
+    whys = table.problems.get(main, ("",) * n)
+    problems = {
+        name: tuple(
+            "" if np.isfinite(value) else why or f"{name} finds no hold on it"
+            for value, why in zip(values.tolist(), whys, strict=True)
+        )
+        for name, values in diameters.items()
+    }
+    return replace(table, diameters_cm=diameters, intervals_cm=intervals, problems=problems)
 
 
 def _compared(tables: Sequence[StemTable], request: EvaluationRequest) -> Comparison:
     reference = read_stem_table(request.reference, request.reference_reading)
+    if "id" not in request.reference_reading.columns:
+        reference = numbered_as_files(reference, tables)
     if request.combine_stems:
         tables, reference = [combined(table) for table in tables], combined(reference)
     main = reference.methods[0]
     if not any(math.isfinite(value) for value in reference.diameters_cm[main].tolist()):
         raise MalformedFileError(
-            request.reference, "it has no usable diameter.", "Name the column that holds them: dbh=COLUMN."
+            request.reference,
+            "it has no usable diameter.",
+            "Name the column that holds them: --reference-column dbh=COLUMN.",
         )
     return compare(tables, reference, by=request.by, rule=request.rule, pool=request.pool)
 
@@ -309,7 +358,7 @@ def section_pictures(session: Session, comparison: Comparison) -> tuple[SectionP
         if chosen is None:
             continue
         outlines = {name: fit.outline_uv_m for name, fit in sorted(fits.items(), key=lambda f: f[0] != result.curve)}
-        title = f"{word}tree {sample.tree or sample.stem} ({sample.error_pct:+.1f} %)"
+        title = f"{word}tree {sample.tree or sample.stem} ({round(sample.error_pct or 0.0, 1) + 0.0:+.1f} %)"
         pictures.append(SectionPicture(title, result.section.uv_m, chosen.inliers, outlines, sample.reference_cm))
     return tuple(pictures)
 

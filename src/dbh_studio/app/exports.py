@@ -22,8 +22,11 @@ from dbh_studio.errors import FileError, SettingError
 from dbh_studio.io.inventory_csv import check_not_source
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from dbh_studio.core.ground import GroundModel
     from dbh_studio.core.inventory import Inventory
+    from dbh_studio.core.stem_profile import ProfilePoint
     from dbh_studio.io.exports.edit_log import LogEntry
     from dbh_studio.io.exports.report_model import Report
 
@@ -40,7 +43,9 @@ __all__ = [
     "plot_area",
 ]
 
-Format = Literal["csv", "gpkg", "geojson", "xlsx", "report", "pdf", "3d", "edits", "svg", "dxf", "laz", "las"]
+Format = Literal[
+    "csv", "gpkg", "geojson", "xlsx", "report", "pdf", "3d", "profile", "edits", "svg", "dxf", "laz", "las"
+]
 FORMATS: tuple[Format, ...] = get_args(Format)
 TITLES: dict[Format, str] = {
     "csv": "inventory, one row per stem",
@@ -50,6 +55,7 @@ TITLES: dict[Format, str] = {
     "report": "report to read and print, one HTML file",
     "pdf": "the report as PDF, printed by a Chromium or Chrome of this computer",
     "3d": "the plot to look at in 3D, one HTML file",
+    "profile": "diameters along each stem, every 10 cm with their intervals, as CSV; takes a while",
     "edits": "who changed what and when, as CSV",
     "svg": "stem map to look at and print",
     "dxf": "stem map for CAD",
@@ -66,7 +72,7 @@ class ExportRequest:
 
     Attributes:
         formats: In which files.
-        units: Of diameters and heights in tables and pages; the CSV is always metric, so that it can be read back.
+        units: Of diameters and heights in tables and pages; CSVs are always metric, so that they can be read back.
         area: The plot, for the stand table and the maps; None takes the rectangle around the cloud, see `plot_area`.
         area_frame: What `area` was given in, see `plot_areas.placed_area`.
         class_width: Of the stand table's diameter classes, cm or inches; None takes 5 cm or 2 inches.
@@ -142,6 +148,7 @@ _ENDINGS = {
     "report": "_report.html",
     "pdf": "_report.pdf",
     "3d": "_3d.html",
+    "profile": "_profile.csv",
     "edits": "_edits.csv",
     "svg": "_map.svg",
     "dxf": "_map.dxf",
@@ -217,6 +224,8 @@ class _Writer:
             exports.write_dxf(path, self.table, area=self.area)
         elif kind == "edits":
             exports.write_edits_csv(path, self.log)
+        elif kind == "profile":
+            exports.write_profiles_csv(path, self.inventory, self._profiles(progress))
         elif kind in ("report", "pdf"):
             self._write_report(kind, path, progress)
         elif kind == "3d":
@@ -239,6 +248,12 @@ class _Writer:
             from dbh_studio.app.report_pdf import write_report_pdf
 
             write_report_pdf(path, exports.report_html(self._report))
+
+    def _profiles(self, progress: Progress) -> Iterator[tuple[int, tuple[ProfilePoint, ...]]]:
+        ids = [row.stem_id for row in self.inventory]
+        for number, stem_id in enumerate(ids):
+            progress(number / len(ids), f"Looking along stem {stem_id}")
+            yield stem_id, self.session.profile(stem_id, document=self.document)
 
     def _write_cloud(self, path: Path, progress: Progress) -> None:
         from dbh_studio.io import exports

@@ -9,7 +9,7 @@ from typing import Any
 
 from dbh_studio.cli.common import add_relocation_option, finite_number, path_argument, plain, progress_for
 
-_FORMATS = ("csv", "gpkg", "geojson", "xlsx", "report", "pdf", "3d", "edits", "svg", "dxf", "laz", "las")
+_FORMATS = ("csv", "gpkg", "geojson", "xlsx", "report", "pdf", "3d", "profile", "edits", "svg", "dxf", "laz", "las")
 
 
 def add_commands(commands: Any) -> None:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 PROFILE_COLUMNS = ("file", "stem_id", "height_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "coverage_deg", "reason")
 COLUMNS = (
-    "file", "stem_id", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "dbh_method", "dbh_definition",
+    "file", "stem_id", "tag", "x_m", "y_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "dbh_method", "dbh_definition",
     "dbh_tape_cm", "dbh_tape_lo_cm", "dbh_tape_hi_cm", "dbh_curve_cm", "dbh_curve_lo_cm", "dbh_curve_hi_cm",
     "dbh_area_cm", "dbh_area_lo_cm", "dbh_area_hi_cm", "hom_m", "breast_height_m", "base", "along", "above",
     "coverage_deg", "max_gap_deg", "rmse_mm", "n_points", "lean_deg", "taper_cm_per_m",
@@ -210,7 +210,10 @@ def _measure_plot(
     for i in document.trunks.ids:
         stem = session.compared(i)
         cells = _cells(stem.result, stem_setup_of(document, i).settings, stem.protocol)
-        rows.append({"stem_id": i, **cells, "corrections": ";".join(measured_by(document.record(i).corrections))})
+        x_m, y_m = (round(float(v), 3) if math.isfinite(v) else None for v in stem.xy_m)
+        said = document.record(i)
+        about = {"stem_id": i, "tag": said.tag, "x_m": x_m, "y_m": y_m}
+        rows.append(about | cells | {"corrections": ";".join(measured_by(said.corrections))})
         if options.profile is not None:
             along = _profile(session.profile(i), stem.result, rows[-1], document.scale.relative_sd)
             profiles += [{"stem_id": i} | point for point in along]
@@ -245,7 +248,8 @@ def _cells(result: DbhEstimate | Refusal, settings: MeasureSettings, protocol: P
         }
     else:
         row |= {"quality": "refused", "reason": result.reason, "remedy": result.remedy, "flags": result.code}
-    for name, fit in result.fits.items():
+    # The curve that was refused is there to be looked at, and its diameter is not to be believed.
+    for name, fit in result.fits.items() if isinstance(result, DbhEstimate) else ():
         if isinstance(fit, CurveFit) and f"{name}_cm" in COLUMNS:
             row[f"{name}_cm"] = round(100 * fit.diameter_m(settings.definition), 2)
     return row
@@ -257,21 +261,14 @@ def _profile(
     """The rows of a stem's profile; what it says against the diameter is added to `row`, in words and as a flag."""
     from dbh_studio.core.dbh import DbhEstimate
     from dbh_studio.core.stem_profile import breast_height_flag
+    from dbh_studio.io.exports.stem_profiles import height_cells
 
     if isinstance(result, DbhEstimate) and "profile" not in result.flag_codes:
         flag = breast_height_flag(profile, result.hom_m, result.diameters[result.definition], scale_sd=scale_sd)
         if flag is not None:
             row["reason"] = "; ".join(filter(None, (row["reason"], flag.words)))
             row["flags"] = ";".join(filter(None, (row["flags"], flag.code)))
-    rows = []
-    for point in profile:
-        cells: dict[str, Any] = {"height_m": f"{point.height_m:.2f}", "reason": point.reason}
-        cells["coverage_deg"] = None if point.arc_deg is None else round(point.arc_deg, 1)
-        if point.diameter is not None and point.diameter.low_cm is not None and point.diameter.high_cm is not None:
-            cells["dbh_cm"] = round(point.diameter.value_cm, 2)
-            cells["dbh_lo_cm"], cells["dbh_hi_cm"] = round(point.diameter.low_cm, 2), round(point.diameter.high_cm, 2)
-        rows.append(cells)
-    return rows
+    return [height_cells(point) for point in profile]
 
 
 def _intervals(result: DbhEstimate) -> dict[str, float | None]:

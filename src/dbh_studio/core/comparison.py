@@ -27,6 +27,8 @@ _FACTORS = {
     np.pi: "girths and diameters", 1 / np.pi: "girths and diameters",
 }  # fmt: skip
 _FACTOR_TOLERANCE = 0.08
+# Of two tables of one stand numbered independently R² is about 1/n, and half the diameters are off by a quarter.
+_STRANGERS_N, _STRANGERS_R2, _STRANGERS_PCT = 8, 0.3, 12.0
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,8 @@ def compare(
         notes += [prefix + note for note in (*pairing.notes, *_pairing_notes(table, reference, pairing))]
     lines = table_lines(samples, categories)
     notes += _doubts(samples, reference)
+    for named, pairing in zip(names, pairings, strict=True):
+        notes += _strangers(lines, next(iter(named.values())), pairing)
     return Comparison(reference, inventories, pairings, tuple(samples), categories, lines, tuple(notes))
 
 
@@ -351,6 +355,25 @@ def _pairing_notes(table: StemTable, reference: StemTable, pairing: Pairing) -> 
     return notes
 
 
+def _strangers(lines: Sequence[Line], method: str, pairing: Pairing) -> list[str]:
+    """Whether equal numbers seem to be those of other trees, where no places were there to tell.
+
+    The pairs stay as they are: diameters choose no pair.
+    """
+    if pairing.by != "id" or pairing.is_checked:
+        return []
+    s = next(line.statistics for line in lines if not line.column and line.method == method)
+    if s.n < _STRANGERS_N or s.r_squared is None or s.median_rel_err_pct is None:
+        return []
+    if s.r_squared > _STRANGERS_R2 or s.median_rel_err_pct < _STRANGERS_PCT:
+        return []
+    return [
+        f"{method}: the diameters of equal numbers have next to nothing to do with each other (R² {s.r_squared:.2f}, "
+        f"half of them off by over {s.median_rel_err_pct:.0f} %). Were the trees numbered anew? Then a place of each "
+        "tree is needed in both tables (columns x and y)."
+    ]
+
+
 def _doubts(samples: Sequence[Sample], reference: StemTable) -> list[str]:
     """A factor between estimates and references that a wrong unit would make."""
     notes = []
@@ -365,6 +388,7 @@ def _doubts(samples: Sequence[Sample], reference: StemTable) -> list[str]:
             if abs(middle / factor - 1.0) < _FACTOR_TOLERANCE:
                 notes.append(
                     f"{method}: the estimates are {middle:.3g} times the diameters of {reference.name} (median): were "
-                    f"{what} mixed up?"
+                    f"{what} mixed up? Units can be said: --inventory-unit, --reference-unit, or a heading such as "
+                    "dbh_mm."
                 )
     return notes

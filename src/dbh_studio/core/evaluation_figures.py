@@ -20,7 +20,7 @@ from dbh_studio.core.evaluation import Sample, TukeyBox, measured_arrays, relati
 _COLOURS = ("#d9480f", "#0b7285", "#a61e8c", "#2b8a3e", "#364fc7", "#5c3d2e", "#868e96")
 _INK, _FAINT, _GRID = "#212529", "#868e96", "#e9ecef"
 _PANEL, _LEFT, _BOTTOM, _TOP, _GAP = 300.0, 58.0, 48.0, 30.0, 26.0
-_PER_ROW = 4
+_PER_ROW, _LEAST_BOX = 4, 46.0
 _LEGEND = 22.0
 _FONT = "system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-serif"
 _MAX_DOTS = 900
@@ -67,17 +67,20 @@ def boxes_svg(panels: Mapping[str, Sequence[Sample]], methods: Sequence[str]) ->
     ends = [max((b.whiskers[1], *b.outliers)) for row in boxes.values() for b in row if b is not None]
     # A few wild values must not press all boxes flat; what lies above is counted at the edge.
     whiskers = [b.whiskers[1] for row in boxes.values() for b in row if b is not None]
-    top = _nice_top(min(max(ends, default=10.0), 2.5 * max(whiskers, default=10.0)))
+    # An axis from 0 to 0 is none: where all errors are 0, as of a table against itself, it ends at 1 %.
+    top = max(_nice_top(min(max(ends, default=10.0), 2.5 * max(whiskers, default=10.0))), 1.0)
+    # So wide that what stands under a box does not run into that of the next.
+    width = max(_PANEL, _LEAST_BOX * len(methods))
     cells = []
     for k, (title, row) in enumerate(boxes.items()):
-        frame = _Frame(*_place(k), (0.0, float(len(methods))), (0.0, top))
+        frame = _Frame(*_place(k, width), (0.0, float(len(methods))), (0.0, top), width)
         label = "Relative error (%)" if k % _PER_ROW == 0 else ""
         body = [frame.axes(title, "", label, x_ticks=False)]
         for column, (method, box) in enumerate(zip(methods, row, strict=True)):
             n = sum(s.method == method and s.outcome == "measured" for s in panels[title])
             body.append(_box(frame, column + 0.5, box, n, _colour(methods, method)))
         cells.append("".join(body))
-    return _document(cells, methods, "Relative error")
+    return _document(cells, methods, "Relative error", panel_px=width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,19 +148,20 @@ class _Frame:
     top: float
     x_range: tuple[float, float]
     y_range: tuple[float, float]
+    width: float = _PANEL
 
     def x(self, value: float) -> float:
         low, high = self.x_range
-        return self.left + _PANEL * (value - low) / (high - low)
+        return self.left + self.width * (value - low) / (high - low)
 
     def y(self, value: float) -> float:
         low, high = self.y_range
         return self.top + _PANEL * (1.0 - (value - low) / (high - low))
 
     def axes(self, title: str, x_label: str, y_label: str, *, x_ticks: bool = True, ticks: int = 6) -> str:
-        middle, bottom = self.left + 0.5 * _PANEL, self.top + _PANEL
+        middle, bottom = self.left + 0.5 * self.width, self.top + _PANEL
         parts = [
-            f'<rect x="{self.left:.1f}" y="{self.top:.1f}" width="{_PANEL:.0f}" height="{_PANEL:.0f}" fill="#fff" '
+            f'<rect x="{self.left:.1f}" y="{self.top:.1f}" width="{self.width:.0f}" height="{_PANEL:.0f}" fill="#fff" '
             f'stroke="{_FAINT}"/>',
             _text(middle, self.top - 9, title, size=14, weight=600),
             _text(middle, bottom + 38, x_label, size=12),
@@ -166,7 +170,7 @@ class _Frame:
             at = f"{self.left - 42:.1f} {self.top + 0.5 * _PANEL:.1f}"
             parts.append(f'<g transform="translate({at}) rotate(-90)">{_text(0, 0, y_label, size=12)}</g>')
         for value in _ticks(self.y_range, ticks):
-            parts.append(self._rule(f"M{self.left:.1f} {self.y(value):.1f}h{_PANEL:.0f}"))
+            parts.append(self._rule(f"M{self.left:.1f} {self.y(value):.1f}h{self.width:.0f}"))
             parts.append(_text(self.left - 6, self.y(value) + 4, f"{value:g}", size=11, anchor="end"))
         for value in _ticks(self.x_range, ticks) if x_ticks else ():
             parts.append(self._rule(f"M{self.x(value):.1f} {self.top:.1f}v{_PANEL:.0f}"))
@@ -178,17 +182,23 @@ class _Frame:
         return f'<path d="{path}" stroke="{_GRID}"/>'
 
 
-def _place(k: int) -> tuple[float, float]:
+def _place(k: int, width: float = _PANEL) -> tuple[float, float]:
     """Left upper corner of panel number k."""
     row, column = divmod(k, _PER_ROW)
-    return _LEFT + column * (_PANEL + _GAP + 20.0), _LEGEND + _TOP + row * (_PANEL + _TOP + _BOTTOM)
+    return _LEFT + column * (width + _GAP + 20.0), _LEGEND + _TOP + row * (_PANEL + _TOP + _BOTTOM)
 
 
 def _document(
-    cells: Sequence[str], names: Sequence[str], title: str, *, more: Sequence[str] = (), is_fluid: bool = False
+    cells: Sequence[str],
+    names: Sequence[str],
+    title: str,
+    *,
+    more: Sequence[str] = (),
+    is_fluid: bool = False,
+    panel_px: float = _PANEL,
 ) -> str:
     n_columns, n_rows = min(max(len(cells), 1), _PER_ROW), max(math.ceil(len(cells) / _PER_ROW), 1)
-    width = _LEFT + n_columns * (_PANEL + _GAP + 20.0) - 20.0
+    width = _LEFT + n_columns * (panel_px + _GAP + 20.0) - 20.0
     height = _LEGEND + n_rows * (_PANEL + _TOP + _BOTTOM)
     legend, at = [], _LEFT
     for name in (*names, *more):
@@ -269,7 +279,9 @@ def _box(frame: _Frame, column: float, box: TukeyBox | None, n: int, colour: str
     ]
     if len(seen) < len(box.outliers):
         hidden = len(box.outliers) - len(seen)
-        parts.append(_text(centre, frame.top + 13, f"▲ {hidden} more, up to {box.outliers[-1]:.0f}", size=10))
+        # Beside many others there is room for the farthest alone.
+        told = f"▲ {hidden} more, up to " if frame.x(1.0) - frame.x(0.0) > 120.0 else "▲ "
+        parts.append(_text(centre, frame.top + 13, f"{told}{box.outliers[-1]:.0f}", size=10))
     return label + "".join(parts)
 
 

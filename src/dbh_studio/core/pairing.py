@@ -36,6 +36,7 @@ class Pairing:
         outside_reference: Rows of the reference in plots the inventory does not have.
         frames: One for each plot that was paired by place.
         notes: What to know about it, in plain words.
+        is_checked: Whether the places of equal numbers were seen to agree.
     """
 
     by: Literal["id", "position"]
@@ -48,6 +49,7 @@ class Pairing:
     outside_reference: tuple[int, ...] = ()
     frames: tuple[FrameFit, ...] = ()
     notes: tuple[str, ...] = ()
+    is_checked: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,7 @@ def pair_stems(inventory: StemTable, reference: StemTable, rule: PairingRule | N
         *outside,
         frames=tuple(found.frames),
         notes=(*notes, *more, *_frame_notes(found.frames)),
+        is_checked=by == "id" and rule.by == "auto" and inventory.has_positions and reference.has_positions,
     )
 
 
@@ -174,7 +177,9 @@ def _way(
         if not can_id:
             lacking = a if not a.has_ids else b
             what = "numbers" if wanted == "id" else "numbers and no places that both tables have"
-            raise StudioError(f"{lacking.name} has no {what}.", "Name the column that holds them.")
+            raise StudioError(
+                f"{lacking.name} has no {what}.", "Name the columns that hold numbers (id) or places (x and y)."
+            )
         told = "" if wanted == "id" else " There are no places in both tables to check them by."
         return "id", [f"Paired by number.{told}"]
     if wanted == "position":

@@ -131,7 +131,8 @@ def data_name(line: Line) -> str:
 def markdown_text(text: str) -> str:
     """Text that means nothing to Markdown or HTML."""
     flat = re.sub(r"[\x00-\x1f\x7f]+", " ", text)
-    return re.sub(r"([\\`*_\[\]|~])", r"\\\1", flat).replace("<", "&lt;").replace(">", "&gt;")
+    marked = re.sub(r"([\\`*_\[\]|~])", r"\\\1", flat)
+    return marked.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 REMARKS = (
@@ -165,6 +166,7 @@ def table_latex(lines: Sequence[Line]) -> str:
             body.append(f"{'' if row else first} & {' & '.join(cells)} \\\\")
     return "\n".join(
         [
+            r"% Needs \usepackage{booktabs,multirow}.",
             r"\begin{table}",
             r"\caption{DBH estimation metrics.}",
             r"\centering",
@@ -183,11 +185,12 @@ def table_latex(lines: Sequence[Line]) -> str:
 
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", "[": "{[}", "]": "{]}", "*": "{*}",
 }  # fmt: skip
 
 
 def latex_text(text: str) -> str:
-    """Text that means nothing to LaTeX."""
+    """Text that means nothing to LaTeX, nor to the end of the row before it: it takes stars and brackets as its own."""
     flat = re.sub(r"[\x00-\x1f\x7f]+", " ", text)
     return "".join(_LATEX.get(letter, letter) for letter in flat)

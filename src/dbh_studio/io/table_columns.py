@@ -5,14 +5,14 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
 from dbh_studio.core.arrays import Float64, readonly
-from dbh_studio.core.stem_table import MAIN, StemTable
+from dbh_studio.core.stem_table import MAIN, StemTable, id_key
 from dbh_studio.errors import FileError, MalformedFileError, SettingError
 from dbh_studio.io.table_diameters import (
     CM_PER,
@@ -128,6 +128,23 @@ def stem_table(cells: CellTable, reading: Reading, *, name: str = "") -> StemTab
     )
 
 
+def numbered_as_files(table: StemTable, others: Sequence[StemTable]) -> StemTable:
+    """A table whose stems go by the files they were cut out into, where the others know them by these names alone."""
+    theirs = [{id_key(number) for number in other.ids} - {""} for other in others]
+    if not theirs or any({id_key(number) for number in table.ids} & names for names in theirs):
+        return table
+    for column, cells in table.cells.items():
+        files = _last_parts(_without_unknown(cells))
+        known = {id_key(number) for number in files}
+        if plain_name(column) in _FILES and all(len(known & names) >= 0.5 * len(names) > 0 for names in theirs):
+            return replace(table, ids=files, notes=(*table.notes, f"{table.name}: numbers from {column} instead."))
+    return table
+
+
+def _last_parts(paths: Sequence[str]) -> tuple[str, ...]:
+    return tuple(re.split(r"[/\\]", path)[-1] for path in paths)
+
+
 def _without_unknown(cells: Sequence[str]) -> tuple[str, ...]:
     return tuple("" if is_unknown(cell) else cell for cell in cells)
 
@@ -177,7 +194,7 @@ class _Roles:
             raise MalformedFileError(
                 self.cells.path,
                 f"no column of diameters was found among {', '.join(self.cells.columns)}.",
-                "Name it: dbh=COLUMN.",
+                "Call it dbh_cm in the table, or name it: --inventory-column or --reference-column dbh=COLUMN.",
             )
         return self._by_method(main) if self.reading.find_methods else {MAIN: main}
 
@@ -232,13 +249,14 @@ class _Roles:
         if named is not None or self.is_off("id"):
             return named
         if self.is_ours:
-            return self.first_of(("tag", "tree_id" if self.reading.by_tree else "stem_id"))
+            # Stems measured one by one from files of their own have no other number.
+            return self.first_of(("tag", "tree_id" if self.reading.by_tree else "stem_id", *_FILES))
         return self.first_of(_IDS)
 
     def numbers_in(self, column: str) -> tuple[str, ...]:
         """The numbers of a column that holds them."""
         cells = _without_unknown(self.cells.columns[column])
-        return tuple(re.split(r"[/\\]", c)[-1] for c in cells) if self.names[column] in _FILES else cells
+        return _last_parts(cells) if self.names[column] in _FILES else cells
 
     def plot(self) -> str | None:
         named = self.named("plot")

@@ -12,6 +12,7 @@ import viser
 from dbh_studio.core.evaluation import ALL, MIN_N, Line, Sample
 from dbh_studio.core.evaluation_figures import sample_title, scatter_svg
 from dbh_studio.errors import StudioError
+from dbh_studio.io.evaluation_report import rounded
 from dbh_studio.ui import html
 from dbh_studio.ui.bridge import call, esc
 from dbh_studio.ui.panels.base import set_content, set_value, set_visible, typed_path
@@ -26,6 +27,14 @@ if TYPE_CHECKING:
     from dbh_studio.ui.tab import Tab
 
 _PAIR_BY: dict[str, PairBy] = {"as found": "auto", "number": "id", "place": "position"}
+# In the words of `Grouping.parse`.
+_APART = {
+    "nothing": "",
+    "quality": "inventory:quality",
+    "ring seen": "inventory:coverage_deg:180,270",
+    "diameter": "reference_cm",
+}
+_MOST_KINDS = 12
 _WORST_SHOWN = 15
 _OTHERS_SHOWN = 10
 
@@ -37,6 +46,7 @@ class EvaluationSection:
         self.tab = tab
         self._done: tuple[Session, Document, EvaluationRequest, Comparison] | None = None
         self._shown_for: Session | None = None
+        self._offered = dict(_APART)
         gui, worker = tab.client.gui, tab.worker
         self._folder = gui.add_folder("Compare with field measurements", expand_by_default=False, visible=False)
         with self._folder:
@@ -48,9 +58,20 @@ class EvaluationSection:
             self._by = gui.add_dropdown(
                 "Pair by", tuple(_PAIR_BY), hint="as found: by number where the places agree with it, else by place"
             )
+            self._apart = gui.add_dropdown(
+                "Tell apart by",
+                tuple(_APART),
+                hint="a line for each kind of tree; the columns of the field table can be chosen once it was read",
+            )
+            self._methods = gui.add_checkbox(
+                "Every method", False, hint="also by the circle and the paper's three curves; takes longer"
+            )
             compare = gui.add_button("Compare", icon=viser.Icon.SCALE, color="green")
             worker.on_click(compare, self._compare)
+            for handle in (self._apart, self._methods):
+                worker.on_update(handle, self._compare_again)
             self._state = gui.add_html("")
+            self._lines = gui.add_html("", visible=False)
             self._plot = gui.add_html("", visible=False)
             self._worst = gui.add_html("", visible=False)
             self._tapes = gui.add_button(
@@ -75,7 +96,9 @@ class EvaluationSection:
             self._shown_for, self._done = session, None
             for field in (self._path, self._out):
                 set_value(field, "")
-        for handle in (self._plot, self._worst, self._tapes, self._out, self._write):
+            self._offer(_APART)
+            set_value(self._methods, False)
+        for handle in (self._lines, self._plot, self._worst, self._tapes, self._out, self._write):
             set_visible(handle, self._done is not None)
         if self._done is None or session is None:
             set_content(
@@ -87,12 +110,14 @@ class EvaluationSection:
         is_old = session.document is not document
         old = html.message("The plot has changed since. Press Compare again.") if is_old else ""
         set_content(self._state, old + summary(comparison))
+        set_content(self._lines, lines_table(comparison))
         set_content(self._plot, scatter(comparison))
         set_content(self._worst, misfits(comparison))
 
     def _compare(self) -> None:
         # Here, not above: scipy takes a second to import, and most sessions compare nothing.
         from dbh_studio.app.evaluation import EvaluationRequest, evaluate_plot
+        from dbh_studio.core.comparison import Grouping
         from dbh_studio.core.stem_layout import PairingRule
 
         session = self.tab.require_session()
@@ -101,15 +126,35 @@ class EvaluationSection:
             raise StudioError("No table was named.", "Type the path of a table with diameters measured in the field.")
         document = session.document
         _check_measured(session, document)
-        request = EvaluationRequest(path, rule=PairingRule(_PAIR_BY[self._by.value]))
+        apart = self._offered.get(self._apart.value, "")
+        request = EvaluationRequest(
+            path,
+            by=(Grouping.parse(apart),) if apart else (),
+            rule=PairingRule(_PAIR_BY[self._by.value]),
+            every_method=self._methods.value,
+        )
         self._done = None  # what is on screen must not pass for the answer while this one fails
         try:
             comparison = evaluate_plot(session, request)
             self._done = session, document, request, comparison
+            self._offer(_APART | columns_to_tell_apart(comparison))
             if not self._out.value:
                 set_value(self._out, str(_beside(session) / f"{document.plot_id or 'plot'}_evaluation"))
         finally:
             self.refresh()
+
+    def _compare_again(self, _: object = None) -> None:
+        """What is on screen follows what is chosen; before the first comparison there is nothing to follow."""
+        if self._done is not None:
+            self._compare()
+
+    def _offer(self, words: dict[str, str]) -> None:
+        """Let these be chosen from; what is chosen stays, where it is still there."""
+        if tuple(words) != tuple(self._offered):
+            chosen = self._apart.value if self._apart.value in words else next(iter(words))
+            self._offered = words
+            self._apart.options = tuple(words)
+            set_value(self._apart, chosen)
 
     def _keep_tapes(self) -> None:
         """Keep the field value of every tree that has a pair, refused ones among them."""
@@ -180,6 +225,8 @@ def summary(comparison: Comparison) -> str:
             ("MAD, rCV", f"{s.mad_cm:.2f} cm, {s.rcv_pct:.1f} %"),
             ("Median relative error", f"{s.median_rel_err_pct:.1f} %"),
         ]
+    if s.p90_rel_err_pct is not None:
+        pairs.append(("9 of 10 are within", f"{s.p90_rel_err_pct:.1f} %"))
     if s.r_squared is not None:
         pairs.append(("R²", f"{s.r_squared:.3f}"))
     if s.n_intervals:
@@ -190,6 +237,55 @@ def summary(comparison: Comparison) -> str:
     pairs.append(("Only in this plot", str(line.n_extra)))
     few = "" if s.n >= MIN_N else html.message(f"{s.n} trees are too few for bias and scatter: {MIN_N} are needed.")
     return f'{few}<div class="dbh">{html.facts(pairs)}</div>'
+
+
+def columns_to_tell_apart(comparison: Comparison) -> dict[str, str]:
+    """Columns of both tables with a few different values: what is offered, and the same for `Grouping.parse`."""
+    offered = {}
+    for table, where, words in (
+        (comparison.reference, "reference", "field table"),
+        (comparison.inventories[0], "inventory", "this plot"),
+    ):
+        for column, cells in table.cells.items():
+            kinds = {cell.strip() for cell in cells} - {""}
+            # A column that says something else of every tree tells none apart; a colon would be taken for bounds.
+            if 2 <= len(kinds) <= min(_MOST_KINDS, len(cells) // 2) and ":" not in column and column != "quality":
+                offered[f"{column} ({words})"] = f"{where}:{column}"
+    return offered
+
+
+def lines_table(comparison: Comparison) -> str:
+    """HTML: a line for each method and each kind of tree; empty where there is one line, which the summary says."""
+    if len(comparison.lines) < 2:
+        return ""
+    with_method = len(comparison.methods) > 1
+    heads = ("Trees", *(("Method",) if with_method else ()), "n", "Bias", "MAD", "rCV %", "R²", "Rel. %", "90th %")
+    heads = (*heads, "RMSE", "No DBH", "Holds")
+    rows = []
+    for line in comparison.lines:
+        s = line.statistics
+        cells = [
+            str(s.n),
+            *(rounded(v, 2, nothing="–") for v in (s.median_bias_cm, s.mad_cm)),
+            rounded(s.rcv_pct, 1, nothing="–"),
+            rounded(s.r_squared, 2, nothing="–"),
+            *(rounded(v, 1, nothing="–") for v in (s.median_rel_err_pct, s.p90_rel_err_pct)),
+            rounded(s.rmse_cm, 2, nothing="–"),
+            str(line.n_refused),
+            f"{s.n_covered}/{s.n_intervals}" if s.n_intervals else "–",
+        ]
+        names = [line.category, *((line.method,) if with_method else ())]
+        texts = "".join(f'<td class="text">{esc(name)}</td>' for name in names)
+        numbers = "".join(f"<td>{esc(cell)}</td>" for cell in cells)
+        rows.append(f'<tr data-line="{esc(line.category)}">{texts}{numbers}</tr>')
+    n_texts = 2 if with_method else 1
+    head = "".join(f"<th{' class=text' if k < n_texts else ''}>{name}</th>" for k, name in enumerate(heads))
+    what = "Bias, MAD and RMSE in centimetres; a dash where too few trees have both diameters."
+    return (
+        '<div class="dbh"><div class="dbh-lines" tabindex="0"><table class="dbh-table" data-columns="even">'
+        f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+        f'<div class="muted">{what}</div></div>'
+    )
 
 
 def scatter(comparison: Comparison) -> str:

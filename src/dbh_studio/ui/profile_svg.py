@@ -8,6 +8,7 @@ from dbh_studio.core.stem_profile import ProfilePoint
 
 _WIDTH, _HEIGHT = 340, 170
 _LEFT, _RIGHT, _TOP, _BOTTOM = 40, 10, 10, 26
+_HALF_WORD = 24  # of the height beside the line
 _CURVE, _HERE = "#1864ab", "#2b8a3e"
 
 
@@ -60,11 +61,14 @@ def _breast_height(x_px: float, height_m: float, ends_m: str, tree_id: int | Non
     line = f'<path d="M{x_px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{_HERE}" stroke-dasharray="4 3"/>'
     if tree_id is None:
         return line
+    # At an end its words would lie on those of the axis, or beyond the picture.
+    near_left, near_right = x_px < _LEFT + _HALF_WORD, x_px > _WIDTH - _RIGHT - _HALF_WORD
+    anchor, x_words = ("start", x_px + 4) if near_left else ("end", x_px - 4) if near_right else ("middle", x_px)
     return (
         f'<g data-height-grip data-tree="{tree_id}" data-height="{height_m:.3f}" data-x="{x_px:.1f}" '
         f'data-scale="{_LEFT} {_WIDTH - _RIGHT} {ends_m}" style="cursor:ew-resize"><title>Drag breast height of this '
         f'tree</title><path d="M{x_px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="#fff" stroke-opacity="0" '
         f'stroke-width="22"/>{line}<circle cx="{x_px:.1f}" cy="{_HEIGHT - _BOTTOM}" r="7" fill="{_HERE}"/>'
-        f'<text x="{x_px:.1f}" y="{_TOP + 2}" text-anchor="middle" font-size="12" font-family="sans-serif" '
+        f'<text x="{x_words:.1f}" y="{_TOP + 2}" text-anchor="{anchor}" font-size="12" font-family="sans-serif" '
         f'fill="{_HERE}">{height_m:.2f} m</text></g>'
     )

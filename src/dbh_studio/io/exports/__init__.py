@@ -9,6 +9,7 @@ from dbh_studio.io.exports.geopackage import write_geopackage
 from dbh_studio.io.exports.report_html import report_html, write_report_html
 from dbh_studio.io.exports.scene_html import write_scene_html
 from dbh_studio.io.exports.spreadsheet import write_xlsx
+from dbh_studio.io.exports.stem_profiles import write_profiles_csv
 
 __all__ = [
     "Column",
@@ -20,6 +21,7 @@ __all__ = [
     "write_geojson",
     "write_geopackage",
     "write_labelled_cloud",
+    "write_profiles_csv",
     "write_report_html",
     "write_scene_html",
     "write_svg",
