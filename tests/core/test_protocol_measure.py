@@ -66,6 +66,16 @@ class TestCourse:
         one, other = (stem_course(each, frame, circle) for each in (points, points[::-1].copy()))
         np.testing.assert_allclose(one.log_size, other.log_size, atol=1e-9)
 
+    @pytest.mark.parametrize("column", [0, 1, 2])
+    def test_points_without_a_coordinate_change_nothing(self, column):
+        points = stem(n=2000)
+        circle = 0.1935 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1)
+        frame = Similarity(np.eye(3), np.array([0.0, 0.0, 1.3]))
+        strange = points[:200].copy()
+        strange[:, column] = np.nan
+        one, other = (stem_course(each, frame, circle) for each in (points, np.vstack([strange, points])))
+        np.testing.assert_allclose(one.log_size, other.log_size, atol=1e-9)
+
     def test_nothing_seen_is_no_size(self):
         circle = 0.2 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1)
         frame = Similarity(np.eye(3), np.array([0.0, 0.0, 1.3]))

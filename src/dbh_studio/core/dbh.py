@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Float64, as_points, readonly
+from dbh_studio.core.arrays import Float64, as_points, finite_points, finite_rows, readonly
 from dbh_studio.core.axis import WINDOW, StemAxis, band_m, stem_axis
 from dbh_studio.core.curves import CURVES
 from dbh_studio.core.curves.base import outline_centroid
@@ -79,7 +79,7 @@ def measure_stem(
             line=axis,
         )
     low, high = band_m(settings)
-    finite = np.isfinite(points).all(axis=1)
+    finite = finite_rows(points)
     if not finite.any():
         reason = "The stem has no points." if not len(points) else "None of the stem's points has finite coordinates."
         return Refusal("no_points", reason, "Segment the plot again, or add points to the stem by hand.")
@@ -111,7 +111,7 @@ def axis_of_stem(
         ValueError: The array has a wrong shape, or no point is finite.
     """
     points = as_points(points_m, name="points_m")
-    points = points[np.isfinite(points).all(axis=1)]
+    points = finite_points(points)
     if not len(points):
         raise ValueError("a stem without finite points has no axis")
     breast_height = settings.breast_height_m

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Float64, Int64, readonly
+from dbh_studio.core.arrays import Bool, Float64, finite_rows, readonly
 from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.curve_fits import fit_curve
 from dbh_studio.core.curves import CURVES
@@ -22,7 +23,7 @@ from dbh_studio.core.estimator import EstimatorResult, assess_stem, stem_line
 from dbh_studio.core.measured import CurveFit, DbhEstimate, Flag, Refusal
 from dbh_studio.core.quality import FAIR_HALF_WIDTH, grade_of_interval
 from dbh_studio.core.robust import canonical_order
-from dbh_studio.core.section import CrossSection
+from dbh_studio.core.section import CrossSection, radius_at
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings, MeasureSettings
 
@@ -34,6 +35,7 @@ _LEAST_SHOWN = 30
 _ON_CURVE = 3.0
 
 
+@lru_cache(maxsize=64)
 def estimator_settings(settings: MeasureSettings, method: str) -> EstimatorSettings:
     """What the estimator is to do, by the settings of measuring."""
     return EstimatorSettings(
@@ -75,15 +77,15 @@ def measured_with_interval(
         scale_sd: Relative standard error of the cloud's scale.
         line: Where the stem is, from `line_of_stem`, if it was looked for already.
     """
-    finite = points[np.isfinite(points).all(axis=1)]
+    is_finite = finite_rows(points)
+    finite = points if is_finite.all() else points[is_finite]
     options = estimator_settings(settings, settings.curve)
     found = assess_stem(finite, settings=options, scale_sd=scale_sd, seed=seed, line=line)
     if found.result is None:
         assert found.refusal is not None
         return found.refusal
     result = found.result
-    indices = np.flatnonzero(np.isfinite(points).all(axis=1))
-    section = _section(points, indices, result, settings)
+    section = _section(points, is_finite, result, settings)
     fits: dict[str, CurveFit | Refusal] = {settings.curve: _as_fit(settings.curve, result, section.uv_m)}
     fits.update(
         (name, compared_fit(name, finite, section, settings, seed, scale_sd=scale_sd))
@@ -129,23 +131,22 @@ def _estimate(
 
 
 def _section(
-    points: NDArray[np.floating[Any]], indices: Int64, result: EstimatorResult, settings: MeasureSettings
+    points: NDArray[np.floating[Any]], is_finite: Bool, result: EstimatorResult, settings: MeasureSettings
 ) -> CrossSection:
     """The stem about breast height, across the axis that was found; all of it where little was seen there."""
     options = estimator_settings(settings, settings.curve)
-    height = points[indices, 2] - options.breast_height_m
-    shown = np.abs(height) <= _PICTURE_M
+    height = points[:, 2] - options.breast_height_m
     low, high = -_PICTURE_M, _PICTURE_M
-    if shown.sum() < _LEAST_SHOWN:
+    chosen = np.flatnonzero(is_finite & (np.abs(height) <= _PICTURE_M))
+    if len(chosen) < _LEAST_SHOWN:
         low, high = -options.below_m, options.above_m
-        shown = (height >= low) & (height <= high)
-    chosen = indices[shown]
-    band = points[chosen].astype(np.float64)
+        chosen = np.flatnonzero(is_finite & (height >= low) & (height <= high))
+    band = points.take(chosen, axis=0).astype(np.float64)
     order = canonical_order(band)
     chosen, band = chosen[order], band[order]
     uv = result.stem_from_section.inverse().apply(band)[:, :2]
     radius = 0.01 * 0.5 * result.diameters["area"].value_cm
-    error = np.abs(np.hypot(uv[:, 0], uv[:, 1]) - radius)
+    error = np.abs(np.sqrt(uv[:, 0] ** 2 + uv[:, 1] ** 2) - radius)
     gate = settings.ring_gate * radius + settings.ransac_tolerance_m if settings.ring_gate else np.inf
     return CrossSection(
         readonly(uv),
@@ -174,9 +175,8 @@ def _as_fit(name: str, result: EstimatorResult, uv_m: Float64) -> CurveFit:
     outline = result.outline_uv_m
     perimeter, area, girth = outline_metrics(outline)
     radius = np.hypot(outline[:, 0], outline[:, 1])
-    angle = np.arctan2(uv_m[:, 1], uv_m[:, 0])
-    there = np.interp(angle, np.arange(len(radius)) * (2 * np.pi / len(radius)), radius, period=2 * np.pi)
-    error = np.abs(np.hypot(uv_m[:, 0], uv_m[:, 1]) - there)
+    u, v = uv_m.T
+    error = np.abs(np.sqrt(u * u + v * v) - radius_at(radius, np.arctan2(v, u)))
     # As sure as the diameter on the whole, and as uneven as the posterior.
     sd = result.outline_sd_m * (result.log_sd * float(radius.mean()) / max(float(result.outline_sd_m.mean()), 1e-9))
     return CurveFit(

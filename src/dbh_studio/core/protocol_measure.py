@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dbh_studio.core.arrays import finite_rows
 from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.dbh import DbhEstimate, Refusal, axis_of_stem, measure_stem
 from dbh_studio.core.measured import CurveFit, Flag
@@ -68,7 +69,7 @@ def along_the_stem(points_m: NDArray[np.floating[Any]], settings: MeasureSetting
 
     As they are where heights are vertical, or the stem of (N, 3) points hardly leans.
     """
-    if settings.along != "stem" or not np.isfinite(points_m).all(axis=1).any():
+    if settings.along != "stem" or not finite_rows(points_m).any():
         return settings
     axis = axis_of_stem(points_m, settings=settings)
     height = settings.breast_height_m * float(axis.direction[2])
@@ -94,7 +95,7 @@ def _swelling(
     if isinstance(result, DbhEstimate):
         course = _course(points_m, result, reach_m=_LOOK_UP_M)
         return swelling_at(course, height, 0.01 * result.dbh_cm)
-    if axis is None and np.isfinite(points_m).all(axis=1).any():
+    if axis is None and finite_rows(points_m).any():
         axis = axis_of_stem(points_m, settings=settings)
     if axis is None or axis.ring is None:
         return None

@@ -8,6 +8,7 @@ import numpy as np
 
 from dbh_studio.core.arrays import Bool, Float64, Int64
 from dbh_studio.core.curves.base import Curve
+from dbh_studio.core.medians import median
 
 _HYPOTHESES_AT_ONCE = 256
 
@@ -41,8 +42,16 @@ class Circle:
 
 
 def canonical_order(points: Float64) -> Int64:
-    """(N,) indices that sort (N, D) points by their coordinates, whatever order they came in."""
-    return np.lexsort(np.ascontiguousarray(points.T))
+    """(N,) indices that sort (N, D) finite points by their coordinates, whatever order they came in; the last first."""
+    last = np.ascontiguousarray(points[:, -1])
+    order = np.argsort(last)
+    ranked = last[order]
+    again = ranked[1:] == ranked[:-1]
+    if again.any():  # only those that share the last coordinate need the others: ten times quicker than all by all
+        places = np.flatnonzero(np.append(again, False) | np.insert(again, 0, False))
+        tied = np.sort(order[places])
+        order[places] = tied[np.lexsort(points[tied].T)]
+    return order
 
 
 def thinned(points: Float64, n_most: int, rng: np.random.Generator) -> Float64:
@@ -225,15 +234,7 @@ def _refined(
 
 def tukey_sigma(error: Float64) -> float:
     """Robust standard deviation about zero: 1.4826 times the median absolute value."""
-    return 1.4826 * _median(np.abs(error))
-
-
-def _median(values: Float64) -> float:
-    """`np.median` of (N,) finite values; for some hundred of them most of its time goes into other cases."""
-    middle = len(values) // 2
-    if len(values) % 2:
-        return float(np.partition(values, middle)[middle])
-    return 0.5 * float(np.partition(values, [middle - 1, middle])[middle - 1 : middle + 1].sum())
+    return 1.4826 * median(np.abs(error))
 
 
 def tukey_weight(error: Float64, sigma: float) -> Float64:

@@ -8,6 +8,7 @@ import numpy as np
 
 from dbh_studio.core.arrays import Bool, Float64, Int64, readonly
 from dbh_studio.core.axis import StemAxis, band_m
+from dbh_studio.core.medians import median
 from dbh_studio.core.robust import Circle, robust_circle
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import MeasureSettings
@@ -102,6 +103,17 @@ def cross_section(
     )
 
 
+def radius_at(radius_m: Float64, angle_rad: Float64) -> Float64:
+    """(N,) radius of an outline in (N,) directions of -π..π, from (M,) radii in even steps that begin at 0."""
+    at = angle_rad * (len(radius_m) / (2 * np.pi))
+    before = np.floor(at)
+    # Directions below 0 count from the end of the outline, as negative indices do.
+    index = before.astype(np.int64)
+    low = radius_m[index]
+    found: Float64 = low + (radius_m[index + 1] - low) * (at - before)
+    return found
+
+
 def ring_coverage(angles_rad: Float64) -> tuple[float, float]:
     """How much of a ring was seen, and the largest unseen sector, both in degrees.
 
@@ -116,7 +128,7 @@ def ring_coverage(angles_rad: Float64) -> tuple[float, float]:
     n_bins = next((n for n in _BIN_COUNTS if len(angles_rad) >= _POINTS_PER_BIN * n), _BIN_COUNTS[-1])
     bins = np.floor((angles_rad + np.pi) * (n_bins / (2 * np.pi))).astype(np.int64) % n_bins
     counts = np.bincount(bins, minlength=n_bins)
-    seen = counts >= max(1.0, _BIN_SHARE * float(np.median(counts[counts > 0])))
+    seen = counts >= max(1.0, _BIN_SHARE * median(counts[counts > 0]))
     width_deg = 360.0 / n_bins
     at = np.flatnonzero(seen)
     gap = int(np.diff(np.append(at, at[0] + n_bins)).max()) - 1

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Bool, Float64, readonly
+from dbh_studio.core.arrays import Bool, Float64, Int64, readonly
+from dbh_studio.core.medians import group_medians
 from dbh_studio.core.robust import tukey_weight
+from dbh_studio.core.section import radius_at
 from dbh_studio.core.transforms import Similarity
 
 STEP_M = 0.10
@@ -28,6 +30,7 @@ _GATE = (0.4, 2.2)  # times the outline: nearer to the axis and farther from it 
 _ROUNDS = 4
 _ODD = (2654435761, 2246822519, 3266489917, 668265263)
 _N_EFFECTIVE = 30.0  # neighbouring points share their error
+_FIRST, _SECOND = np.triu_indices(3)
 _AXIS_SD_M, _AXIS_SD_SLOPE = 0.01, 0.03  # of where the axis passes the section, and more with each metre from it
 
 
@@ -62,19 +65,19 @@ def stem_course(
     """
     upright, z0 = float(frame.rotation[2, 2]), float(frame.translation[2])
     outline_radius = _by_angle(outline_uv_m)
-    inside = (points_m[:, 2] > max(LOWEST_M, z0 - reach_m)) & (points_m[:, 2] < z0 + reach_m)  # NaN is nowhere
-    local = frame.inverse().apply(_thinned(points_m[inside]).astype(np.float64))
-    far = (_GATE[1] * float(outline_radius.max())) ** 2
-    local = local[local[:, 0] ** 2 + local[:, 1] ** 2 < far]
-    angle = np.arctan2(local[:, 1], local[:, 0])
-    reference = np.interp(angle, np.arange(len(outline_radius)) * (2 * np.pi / len(outline_radius)), outline_radius,
-                          period=2 * np.pi)  # fmt: skip
-    radius = np.hypot(local[:, 0], local[:, 1])
-    near = radius > _GATE[0] * reference
+    z = points_m[:, 2]
+    inside = np.flatnonzero((z > max(LOWEST_M, z0 - reach_m)) & (z < z0 + reach_m))  # NaN is nowhere
+    local = frame.inverse().apply(_thinned(points_m.take(inside, axis=0)).astype(np.float64))
+    radius = np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2)
+    near = np.flatnonzero(radius < _GATE[1] * float(outline_radius.max()))
+    (x, y, along), radius = local[near].T, radius[near]
+    angle = np.arctan2(y, x)
+    reference = radius_at(outline_radius, angle)
     # Slabs lie across the stem, by the height at which its axis passes them.
-    slab = np.floor((z0 + local[:, 2] * upright - LOWEST_M) / STEP_M).astype(np.int64)
-    near &= slab >= 0
-    slab, angle, radius, reference = slab[near], angle[near], radius[near], reference[near]
+    slab = np.floor((z0 + along * upright - LOWEST_M) / STEP_M).astype(np.int64)
+    on = np.flatnonzero((radius > _GATE[0] * reference) & (slab >= 0))
+    on = on[np.argsort(slab[on], kind="stable")]
+    slab, angle, radius, reference = slab[on], angle[on], radius[on], reference[on]
     n_slabs = int(slab.max()) + 1 if len(slab) else 0
     height = LOWEST_M + STEP_M * (np.arange(n_slabs) + 0.5)
     size = _sizes(slab, angle, radius, reference, np.abs(height - z0) / upright)
@@ -102,55 +105,52 @@ def _by_angle(outline_uv_m: Float64) -> Float64:
     return np.asarray(np.interp(np.arange(72) * (2 * np.pi / 72), angle[order], radius[order], period=2 * np.pi))
 
 
-def _sizes(slab: NDArray[np.int64], angle: Float64, radius: Float64, reference: Float64, away_m: Float64) -> Float64:
+def _sizes(slab: Int64, angle: Float64, radius: Float64, reference: Float64, away_m: Float64) -> Float64:
     """(H,) size and, together with it, place of the outline in each slab, by robust least squares; NaN where unseen.
 
     Where the axis passes is known the worse the farther a slab is from the section, which matters where one side of
     the stem is seen: there a shift and a size look alike.
+
+    Args:
+        slab: (N,) of the points, ascending.
+        angle: (N,) of the points about the axis.
+        radius: (N,) of the points.
+        reference: (N,) of the outline in their directions.
+        away_m: (H,) how far each slab is from the section.
     """
-    n_slabs = len(away_m)
-    if not n_slabs:
-        return np.empty(0)
-    size = _slab_medians(slab, radius / reference, n_slabs)
-    basis = np.stack([reference, np.cos(angle), np.sin(angle)], axis=1)
-    state = np.stack([size, np.zeros(n_slabs), np.zeros(n_slabs)], axis=1)
-    prior_sd = _AXIS_SD_M + _AXIS_SD_SLOPE * away_m
-    weight = np.ones(len(slab))
-    sigma = np.empty(0)
+    sizes = np.full(len(away_m), np.nan)
+    if not len(slab):
+        return sizes
+    is_first = np.append(True, slab[1:] != slab[:-1])
+    first, row = np.flatnonzero(is_first), np.cumsum(is_first) - 1
+    held, count = slab[first], np.diff(first, append=len(slab))
+    basis = np.stack([reference, np.cos(angle), np.sin(angle)])
+    # What is summed in each slab: 1 and the products of two of the basis, then those with the error.
+    summed = np.concatenate([np.ones((1, len(slab))), basis[_FIRST] * basis[_SECOND], np.empty_like(basis)])
+    state = np.zeros((len(held), 3))
+    state[:, 0] = group_medians(row, radius / reference, count)
+    prior = (_AXIS_SD_M + _AXIS_SD_SLOPE * away_m[held]) ** -2.0
+    normal = np.empty((len(held), 3, 3))
+    weight, sigma = np.empty(0), np.empty(0)
     for step in range(_ROUNDS):
-        error = radius - (basis * state[slab]).sum(axis=1)
+        error = radius - (basis * state.T[:, row]).sum(axis=0)
         if step < 2:
-            sigma = np.maximum(1.4826 * _slab_medians(slab, np.abs(error), n_slabs), 1e-3)
-        weight = tukey_weight(error / sigma[slab], 1.0)
-        total = np.maximum(np.bincount(slab, weight, n_slabs), 1e-9)
-        scale = _N_EFFECTIVE / (total * sigma**2)
-        normal = np.empty((n_slabs, 3, 3))
-        gradient = np.empty((n_slabs, 3))
-        for i in range(3):
-            gradient[:, i] = scale * np.bincount(slab, weight * basis[:, i] * error, n_slabs)
-            for j in range(i, 3):
-                normal[:, i, j] = normal[:, j, i] = scale * np.bincount(
-                    slab, weight * basis[:, i] * basis[:, j], n_slabs
-                )
+            sigma = np.maximum(1.4826 * group_medians(row, np.abs(error), count), 1e-3)
+        weight = tukey_weight(error / sigma[row], 1.0)
+        np.multiply(basis, error, out=summed[7:])
+        sums = np.add.reduceat(weight * summed, first, axis=1)
+        sums *= _N_EFFECTIVE / (np.maximum(sums[0], 1e-9) * sigma**2)
+        normal[:, _FIRST, _SECOND] = normal[:, _SECOND, _FIRST] = sums[1:7].T
+        gradient = sums[7:].T.copy()
         for i in (1, 2):
-            normal[:, i, i] += prior_sd**-2
-            gradient[:, i] -= state[:, i] * prior_sd**-2
+            normal[:, i, i] += prior
+            gradient[:, i] -= state[:, i] * prior
         normal += 1e-9 * np.eye(3)
-        state = state + np.nan_to_num(np.linalg.solve(normal, gradient[..., None])[..., 0])
-    sector = np.floor((angle + np.pi) * (_N_SECTORS / (2 * np.pi))).astype(np.int64) % _N_SECTORS
-    on = weight > 0.1
-    seen_sectors = (np.bincount(slab[on] * _N_SECTORS + sector[on], minlength=n_slabs * _N_SECTORS) > 0).reshape(
-        n_slabs, _N_SECTORS
-    )
-    is_seen = (np.bincount(slab[on], minlength=n_slabs) >= _LEAST_POINTS) & (seen_sectors.sum(axis=1) >= _LEAST_SECTORS)
-    return np.where(is_seen & (state[:, 0] > 0.1), state[:, 0], np.nan)
-
-
-def _slab_medians(slab: NDArray[np.int64], value: Float64, n_slabs: int) -> Float64:
-    """(H,) median of the values in each slab; 1 where there are none."""
-    order = np.argsort(slab + value / (1.000001 * value.max() + 1e-12))
-    count = np.bincount(slab, minlength=n_slabs)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    ordered = value[order]
-    middle = np.minimum(first + np.maximum(count - 1, 0) // 2, len(ordered) - 1)
-    return np.where(count > 0, ordered[middle], 1.0)
+        moved = np.linalg.solve(normal, gradient[..., None])[..., 0]
+        state = state + np.where(np.isfinite(moved), moved, 0.0)
+    on = np.flatnonzero(weight > 0.1)
+    sector = np.floor((angle[on] + np.pi) * (_N_SECTORS / (2 * np.pi))).astype(np.int64) % _N_SECTORS
+    seen = np.bincount(row[on] * _N_SECTORS + sector, minlength=len(held) * _N_SECTORS).reshape(-1, _N_SECTORS)
+    is_seen = (seen.sum(axis=1) >= _LEAST_POINTS) & ((seen > 0).sum(axis=1) >= _LEAST_SECTORS)
+    sizes[held] = np.where(is_seen & (state[:, 0] > 0.1), state[:, 0], np.nan)
+    return sizes

@@ -14,6 +14,7 @@ import numpy as np
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.measured import Diameter, Flag
+from dbh_studio.core.medians import median
 from dbh_studio.core.stem_course import STEP_M, StemCourse
 
 _HERE_M = 0.11  # to either side of a height are two or three slabs
@@ -139,11 +140,11 @@ def _sizes_between(course: StemCourse, low_m: float, high_m: float) -> tuple[Flo
 
 def _line(height: Float64, size: Float64) -> _Line:
     first, second = np.triu_indices(len(height), 1)
-    slope = float(np.median((size[second] - size[first]) / (height[second] - height[first])))
-    at = float(np.median(height))
+    slope = median((size[second] - size[first]) / (height[second] - height[first]))
+    at = median(height)
     rest = size - slope * (height - at)
-    middle = float(np.median(rest))
-    return _Line(slope, middle, at, 1.4826 * float(np.median(np.abs(rest - middle))))
+    middle = median(rest)
+    return _Line(slope, middle, at, 1.4826 * median(np.abs(rest - middle)))
 
 
 def _beside(course: StemCourse, height_m: float) -> _Line | None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Float64, as_points, readonly
+from dbh_studio.core.arrays import Float64, as_points, finite_points, readonly
 from dbh_studio.core.dbh import DbhEstimate, Refusal, measure_stem
 from dbh_studio.core.drawn_ring import drawn_diameter
 from dbh_studio.core.ground import GroundKind, GroundModel
@@ -24,6 +24,8 @@ from dbh_studio.stages.stem_ground import STEM_BASE_NOTE, above, ground_at_stem
 __all__ = ["STEM_BASE_NOTE", "StemMeasurement", "measure_all", "measure_trunk", "profile_trunk"]
 
 _DEFAULTS = MeasureSettings()
+# A ring drawn by hand does not help then: where the ground is, and so its height, its points tell.
+_NONE_LEFT = "No point of the stem is left to measure: all were left out by hand, or have no place."
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ def measure_trunk(
     scale_sd: float = 0.0,
     z_ground_m: float | None = None,
     ring_m: Float64 | None = None,
+    usual_arc_deg: float | None = None,
 ) -> StemMeasurement:
     """Measure one stem.
 
@@ -75,11 +78,14 @@ def measure_trunk(
         scale_sd: Relative standard error of the scale; widens the interval.
         z_ground_m: World height of the stem's base where a person has placed it.
         ring_m: (M, 3) a ring drawn around the stem by hand, world; the diameter is then this ring's.
+        usual_arc_deg: The arc that is needed elsewhere, where a person was content with less; the flag says so.
     """
     points = as_points(points_world, name="points_world")
-    finite = points[np.isfinite(points).all(axis=1)]
+    finite = finite_points(points)
     if not len(finite):
         refusal, protocol = measure_stem(points, settings=settings), Protocol.of(settings)
+        if isinstance(refusal, Refusal) and len(points):
+            refusal = replace(refusal, reason=_NONE_LEFT, remedy="Withdraw “Points left out” in its card.")
         nowhere = readonly(np.full(2, np.nan))
         return StemMeasurement(trunk_id, refusal, nowhere, np.nan, len(points), ground.kind, protocol)
     at = ground_at_stem(finite, ground, settings, z_ground_m=z_ground_m)
@@ -93,6 +99,10 @@ def measure_trunk(
         ring = np.asarray(above(ring_m, at.z_m), np.float64)
         wanted = along_the_stem(stem, settings)
         result = drawn_diameter(ring, stem, result, axis=at.axis, settings=wanted, ground_note=at.note)
+    elif isinstance(result, DbhEstimate) and result.section.coverage_deg < (usual_arc_deg or 0.0):
+        words = f"an arc of {result.section.coverage_deg:.0f}° was accepted by hand"
+        codes = (*result.flag_codes, "arc_accepted")
+        result = replace(result, flags=(*result.flags, words), flag_codes=codes)
     centre = result.position_m if isinstance(result, DbhEstimate) else at.axis.point_m
     protocol = Protocol.of(settings, base=at.base)
     return StemMeasurement(trunk_id, result, readonly(centre[:2].copy()), at.z_m, len(points), ground.kind, protocol)

@@ -13,6 +13,7 @@ from dbh_studio.core.axis import StemAxis, band_m
 from dbh_studio.core.dbh import axis_of_stem
 from dbh_studio.core.ground import GroundModel
 from dbh_studio.core.interval_methods import INTERVAL_METHODS, line_of_stem
+from dbh_studio.core.medians import median
 from dbh_studio.core.protocols import BaseUsed
 from dbh_studio.settings import MeasureSettings
 
@@ -59,8 +60,9 @@ def ground_at_stem(
     """
     if z_ground_m is not None:
         return StemGround(z_ground_m, _axis(above(points, z_ground_m), settings), "", "placed")
-    low = points[:, 2] <= np.quantile(points[:, 2], 0.02) + _FOOT_M
-    first = float(ground.z_at(np.median(points[low, :2], axis=0).astype(np.float64)[None])[0])
+    low = np.flatnonzero(points[:, 2] <= np.quantile(points[:, 2], 0.02) + _FOOT_M)
+    foot = np.array([[median(points[low, 0]), median(points[low, 1])]])
+    first = float(ground.z_at(foot)[0])
     if ground.kind == "stem_base":
         z_ground, note = _own_base(points, first)
         return StemGround(z_ground, _axis(above(points, z_ground), settings), note, "stem")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Float64, as_points, readonly
+from dbh_studio.core.arrays import Float64, as_points, finite_points, finite_rows, readonly
 from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.estimator.bark import bark_share
 from dbh_studio.core.estimator.circle import circle_tube
@@ -34,6 +34,7 @@ from dbh_studio.core.estimator.sample import sample_points
 from dbh_studio.core.estimator.search import search_rings
 from dbh_studio.core.estimator.tube import Tube, wave_basis
 from dbh_studio.core.measured import Diameter, Flag, Refusal, SectionRing
+from dbh_studio.core.medians import median
 from dbh_studio.core.robust import Circle
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
@@ -110,8 +111,9 @@ def assess_stem(
             raise ValueError(f"{name} is {value} but must be finite and not negative")
     points = as_points(points_m, name="points_m")
     seed = settings.seed if seed is None else seed
-    used, heights = _window(points, settings)
+    used = _window(points, settings)
     if len(used) < settings.min_points:
+        heights = finite_points(points)[:, 2].astype(np.float64)
         return Assessment(None, too_few(heights, len(used), _stretch(settings), settings))
     local, origin = _local(used, settings, seed)
     stems = _stems(local, origin, line, settings, seed)
@@ -132,7 +134,7 @@ def stem_line(
         seed: Of the random samples.
     """
     seed = settings.seed if seed is None else seed
-    used, _ = _window(as_points(points_m, name="points_m"), settings)
+    used = _window(as_points(points_m, name="points_m"), settings)
     if len(used) < settings.min_points:
         return None
     local, origin = _local(used, settings, seed)
@@ -161,7 +163,7 @@ def heap_signs(
         settings: Of the estimator.
         seed: Of the sample.
     """
-    used, _ = _window(as_points(points_m, name="points_m"), settings)
+    used = _window(as_points(points_m, name="points_m"), settings)
     if len(used) < settings.min_points:
         return None
     local, origin = _local(used, settings, settings.seed if seed is None else seed)
@@ -171,11 +173,12 @@ def heap_signs(
     return None if curve is None else heap_signs_of(local, curve, prior)
 
 
-def _window(points: NDArray[np.floating[Any]], settings: EstimatorSettings) -> tuple[Float64, Float64]:
-    """(N, 3) finite points of the stretch of stem used, and the heights of all finite points."""
-    points = points[np.isfinite(points).all(axis=1)]
+def _window(points: NDArray[np.floating[Any]], settings: EstimatorSettings) -> Float64:
+    """(N, 3) finite points of the stretch of stem used."""
     low, high = _stretch(settings)
-    return points[(points[:, 2] >= low) & (points[:, 2] <= high)].astype(np.float64), points[:, 2].astype(np.float64)
+    height = points[:, 2]
+    rows = np.flatnonzero(finite_rows(points) & (height >= low) & (height <= high))
+    return points.take(rows, axis=0).astype(np.float64)
 
 
 def _stretch(settings: EstimatorSettings) -> tuple[float, float]:
@@ -185,7 +188,8 @@ def _stretch(settings: EstimatorSettings) -> tuple[float, float]:
 def _local(used: Float64, settings: EstimatorSettings, seed: int) -> tuple[Float64, Float64]:
     """(N, 3) sample of the points about an origin at breast height, and that origin."""
     # Rounded, so that a plot's survey coordinates cost no digits and the sample does not depend on the median's last.
-    origin = np.array([*np.round(np.median(used[:, :2], axis=0), 2), settings.breast_height_m])
+    middle = [median(used[:, 0]), median(used[:, 1])]
+    origin = np.array([*np.round(middle, 2), settings.breast_height_m])
     return used[sample_points(used, settings.max_points, seed=seed)] - origin, origin
 
 

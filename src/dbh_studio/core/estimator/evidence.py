@@ -13,6 +13,7 @@ from dbh_studio.core.estimator.posterior import N_OUTLINE
 from dbh_studio.core.estimator.ring_count import OtherStem
 from dbh_studio.core.estimator.tube import Polar, Tube
 from dbh_studio.core.measured import Flag
+from dbh_studio.core.medians import median, quantiles
 
 ODD_SHAPE = 0.05
 """Outlines less round than this (see `oval_of`) may be two stems."""
@@ -96,7 +97,7 @@ def evidence_of(points: Float64, tube: Tube) -> Evidence | None:
     at, error = near.at.part(on), near.error[on]
     seen = _seen(near.at.angle(), near.error, tube.sigma)
     arc_deg, gap_deg = _arc_and_gap_deg(seen)
-    low, high = np.quantile(at.along, [0.02, 0.98])
+    low, high = quantiles(at.along, (0.02, 0.98))
     bulge, bulge_sd = _bulge(near.at, near.error, tube)
     return Evidence(
         arc_deg,
@@ -104,8 +105,8 @@ def evidence_of(points: Float64, tube: Tube) -> Evidence | None:
         float(np.sqrt((error**2).mean())),
         int(on.sum()),
         np.repeat(seen, N_OUTLINE // len(seen)),
-        float(high - low),
-        float(max(low, -high, 0.0)),
+        high - low,
+        max(low, -high, 0.0),
         *_walls(near.at, near.error, tube),
         bulge,
         bulge_sd,
@@ -196,7 +197,7 @@ def _seen(angle: Float64, error: Float64, sigma: float) -> Float64:
     sector = np.floor((angle + 2 * np.pi) * (n_bins / (2 * np.pi))).astype(np.int64) % n_bins
     count = np.bincount(sector[on], minlength=n_bins) - 0.5 * np.bincount(sector[beside], minlength=n_bins)
     occupied = count[count > 0]
-    least = max(1.0, _BIN_SHARE * float(np.median(occupied))) if len(occupied) else np.inf
+    least = max(1.0, _BIN_SHARE * median(occupied)) if len(occupied) else np.inf
     return (count >= least).astype(np.float64)
 
 
@@ -234,7 +235,7 @@ def _walls(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
     """
     on = np.abs(error) < max(_WALL_CUT * tube.sigma, _WALL_CUT_M)
     angle, off = at.angle()[on], error[on]
-    order = np.argsort(angle, kind="stable")
+    order = np.argsort(angle)
     angle, off = angle[order], off[order]
     # Once more behind the end, so that a window may pass it.
     angle, off = np.concatenate([angle, angle + 2 * np.pi]), np.concatenate([off, off])
@@ -244,11 +245,11 @@ def _walls(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
     for first, last in zip(firsts, lasts, strict=True):
         if last - first >= _WALL_POINTS:
             piece = off[first:last]
-            widths.append(1.4826 * float(np.median(np.abs(piece - np.median(piece)))))
+            widths.append(1.4826 * median(np.abs(piece - median(piece))))
     if len(widths) < 4:
         return 1.0, 0.0
-    thin, thick = np.quantile(widths, [0.15, 0.9])
-    return float(thick / max(thin, 1e-4)), float(np.sqrt(max(thick**2 - thin**2, 0.0)))
+    thin, thick = quantiles(np.array(widths), (0.15, 0.9))
+    return thick / max(thin, 1e-4), float(np.sqrt(max(thick**2 - thin**2, 0.0)))
 
 
 def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
@@ -257,7 +258,7 @@ def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
     elsewhere = ~here
     if min(here.sum(), elsewhere.sum()) < 30:
         return 0.0, np.inf
-    height = float(np.median(error[here]) - np.median(error[elsewhere]))
+    height = median(error[here]) - median(error[elsewhere])
     # Points of one side share their error: a hundred of them tell as much as a few.
     n_told = min(here.sum(), elsewhere.sum()) / 10.0
     return height, float(1.25 * tube.sigma / np.sqrt(n_told))

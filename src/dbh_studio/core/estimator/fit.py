@@ -21,6 +21,7 @@ from dbh_studio.core.arrays import Float64
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.tube import Polar, Tube, cells_of, tukey
 from dbh_studio.core.estimator.viewing import OnBark, on_bark, viewing_of
+from dbh_studio.core.medians import median
 
 CUT = 3.0
 """Tukey's weights end at so many standard deviations."""
@@ -87,17 +88,21 @@ def near_surface(points: Float64, tube: Tube) -> Near | None:
         return None
     at = at.part(rough)
     error = at.distance - tube.surface(at)
-    sigma = _inner_sigma(error[np.abs(error) < gate], tube.radius)
+    sigma = _inner_sigma(error[np.flatnonzero(np.abs(error) < gate)], tube.radius)
     return None if sigma is None else Near(at, error, sigma)
 
 
 def _inner_sigma(error: Float64, radius: float) -> float | None:
     if len(error) < _LEAST_POINTS:
         return None
-    middle = np.median(error)
-    inner = middle - error[error < middle]
-    sigma = 1.4826 * float(np.median(inner)) if len(inner) > 5 else 0.02
-    return float(np.clip(sigma, 0.002, min(0.045, 0.25 * radius + 0.003)))
+    half = len(error) // 2
+    parted = np.partition(error, half)
+    inner, middle = parted[:half], float(parted[half])
+    if len(error) % 2 == 0:
+        middle = 0.5 * (float(inner.max()) + middle)
+    inner = inner[inner < middle]
+    sigma = 1.4826 * (middle - median(inner)) if len(inner) > 5 else 0.02
+    return min(max(sigma, 0.002), 0.045, 0.25 * radius + 0.003)
 
 
 def _improved(bark: OnBark, sigma: float, tube: Tube, prior: StemPrior, highest: int, *, cut: float) -> Tube | None:

@@ -140,11 +140,12 @@ def _layers(at: Polar, error: Float64, sigma: float) -> tuple[Int64, Float64]:
     layer -= layer.min(initial=0)
     n_layers = int(layer.max(initial=0)) + 1
     rows = (np.ones_like(error), at.cos, at.sin)
-    normal = np.empty((n_layers, 3, 3))
+    normal, pull = np.empty((n_layers, 3, 3)), np.empty((n_layers, 3))
     for i in range(3):
+        weighted = weight * rows[i]
+        pull[:, i] = np.bincount(layer, weighted * error, n_layers)
         for j in range(i, 3):
-            normal[:, i, j] = normal[:, j, i] = np.bincount(layer, weight * rows[i] * rows[j], n_layers)
-    pull = np.stack([np.bincount(layer, weight * row * error, n_layers) for row in rows], axis=1)
+            normal[:, i, j] = normal[:, j, i] = np.bincount(layer, weighted * rows[j], n_layers)
     count = np.bincount(layer[weight > 0], minlength=n_layers)
     full = count >= _LAYER_POINTS
     off = np.full(n_layers, np.nan)

@@ -9,15 +9,17 @@ enough is seen the waves that are there are followed, and where nothing is seen 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from dbh_studio.core.arrays import Float64
+from dbh_studio.core.arrays import Float64, readonly
 from dbh_studio.core.estimator.fit import CUT, DRIFT, near_surface
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.skew import surface_shift
 from dbh_studio.core.estimator.tube import Tube, cells_of, tukey, wave_basis
 from dbh_studio.core.estimator.viewing import on_bark, viewing_of
+from dbh_studio.core.medians import median
 
 N_OUTLINE = 72
 """Angles of the outline."""
@@ -29,7 +31,6 @@ _FLOOR_M = 0.0015
 _CORRELATED = 2.0  # neighbouring patches share errors too
 _DEGREES_OF_FREEDOM = 4.0
 _ANGLE = np.arange(N_OUTLINE) * (2 * np.pi / N_OUTLINE)
-_FACING = np.cos(_ANGLE[::2, None] - _ANGLE[None, :])
 # Half the sum over 36 directions of 72 discrete angles falls short of a circle's girth by this.
 _DISCRETE = 1.00016
 
@@ -98,8 +99,8 @@ def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0) -> Pat
     mean = np.stack([np.bincount(cell, weight * row, n_cells) for row in parts])[:, used] / total[used]
     off = np.bincount(cell, weight * error, n_cells)[used] / total[used]
     noise = tube.sigma**2 * np.bincount(cell, weight * bark.variance[on], n_cells)[used] / total[used] ** 2
-    spread = (1.4826 * float(np.median(np.abs(off - np.median(off))))) ** 2
-    scatter = max(spread - float(np.median(noise)), _FLOOR_M**2)
+    spread = (1.4826 * median(np.abs(off - median(off)))) ** 2
+    scatter = max(spread - median(noise), _FLOOR_M**2)
     variance = _CORRELATED * (scatter + noise + (DRIFT * tube.radius * mean[3]) ** 2)
     # A whole patch of something else: Student's t in place of the normal distribution.
     variance = variance * (_DEGREES_OF_FREEDOM + off**2 / variance) / (_DEGREES_OF_FREEDOM + 1.0)
@@ -155,11 +156,13 @@ class _Places:
 
     def frames(self) -> tuple[Float64, Float64, Float64]:
         """(M, 3) unit vectors u, v, w, as `Tube.frame`."""
-        w = np.column_stack([self.slope, np.ones(len(self.slope))])
-        w /= np.linalg.norm(w, axis=1, keepdims=True)
-        u = np.array([1.0, 0.0, 0.0]) - w[:, :1] * w
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        return u, np.cross(w, u), w
+        a, b = self.slope.T
+        wz = 1.0 / np.sqrt(a * a + b * b + 1.0)
+        wx, wy = a * wz, b * wz
+        ux = np.sqrt(1.0 - wx * wx)
+        uy, uz = -wx * wy / ux, -wx * wz / ux
+        v = (wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux)
+        return np.stack([ux, uy, uz], axis=1), np.stack(v, axis=1), np.stack([wx, wy, wz], axis=1)
 
     def polar(self, points: Float64) -> tuple[Float64, Float64, Float64, Float64]:
         """(M, C) cosine, sine, distance and position along, as `Tube.polar`."""
@@ -239,8 +242,12 @@ def _at_nodes(patches: Patches, tube: Tube, prior: StemPrior, radii: Float64) ->
 
 def _linear(points: Float64, weight: Float64, places: _Places, precision: Float64, prior: StemPrior) -> _Fitted:
     cos, sin, distance, along = places.polar(points)
-    parts = np.stack([cos, sin, along * cos, along * sin, -along])
-    design = np.concatenate([parts, wave_basis(cos, sin, prior.highest)]).transpose(1, 0, 2)  # (M, P, C)
+    parts = np.empty((precision.shape[1], *cos.shape))
+    parts[0], parts[1] = cos, sin
+    np.multiply(along, parts[:2], out=parts[2:4])
+    np.negative(along, out=parts[4])
+    wave_basis(cos, sin, prior.highest, out=parts[5:])
+    design = parts.transpose(1, 0, 2)  # (M, P, C)
     target = distance - places.radius[:, None]
     weighted = design * weight
     u, v, _ = places.frames()
@@ -262,8 +269,7 @@ def _diameters(
 ) -> tuple[dict[str, tuple[float, float, float]], Float64]:
     """Quantiles of the diameters over draws of the waves, and (72,) the outline's standard deviation."""
     n_widths, n_nodes, n_params = best.shape
-    half = np.random.default_rng([seed, 205]).standard_normal((n_widths, n_nodes, _DRAWS // 2, n_params))
-    draws = np.concatenate([half, -half], axis=2)
+    draws = _normal_draws(seed, n_widths, n_nodes, n_params)
     waves = (best[:, :, None] + np.matmul(draws, np.swapaxes(root, -1, -2)))[..., 5:]
     highest = 1 + waves.shape[-1] // 2
     basis = wave_basis(np.cos(_ANGLE), np.sin(_ANGLE), highest)
@@ -274,19 +280,43 @@ def _diameters(
     count = np.repeat(belief.ravel() / _DRAWS, _DRAWS)
     keep = count > 3e-4 * count.max()
     outline, count = outline[keep], count[keep] / count[keep].sum()
-    slope = np.gradient(np.pad(outline, ((0, 0), (1, 1)), mode="wrap"), _ANGLE[1], axis=1)[:, 1:-1]
+    square = outline * outline
+    around = np.concatenate([outline[:, -1:], outline, outline[:, :1]], axis=1)
+    slope = (around[:, 2:] - around[:, :-2]) * (0.5 / _ANGLE[1])
     lengths = {
-        "tape": np.max(outline[:, None, :] * _FACING, axis=2).mean(axis=1) * 2.0 * _DISCRETE,
-        "curve": np.sqrt(outline**2 + slope**2).mean(axis=1) * 2.0,
-        "area": np.sqrt((outline**2).mean(axis=1)) * 2.0,
+        "tape": _reach(outline).mean(axis=1) * 2.0 * _DISCRETE,
+        "curve": np.sqrt(square + slope * slope).mean(axis=1) * 2.0,
+        "area": np.sqrt(square.mean(axis=1)) * 2.0,
     }
     mean = count @ outline
     spread = np.sqrt(np.maximum(count @ (outline - mean) ** 2, 0.0))
     return {name: _quantiles(np.log(values), count) for name, values in lengths.items()}, spread
 
 
+@lru_cache(maxsize=8)
+def _normal_draws(seed: int, n_widths: int, n_nodes: int, n_params: int) -> Float64:
+    """(W, M, 4, P) antithetic draws: the same for every stem."""
+    half = np.random.default_rng([seed, 205]).standard_normal((n_widths, n_nodes, _DRAWS // 2, n_params))
+    return readonly(np.concatenate([half, -half], axis=2))
+
+
+def _reach(outline: Float64) -> Float64:
+    """(H, 36) how far (H, 72) outlines reach in every second direction, from the axis: where a tape would touch.
+
+    It touches near that direction: further round even the largest radius reaches less far than the smallest does there.
+    """
+    steps = int(np.arccos(outline.min() / outline.max()) / _ANGLE[1]) + 1
+    around = np.concatenate([outline[:, -steps:], outline, outline[:, :steps]], axis=1)
+    reach = outline[:, ::2]
+    for step in range(1, steps + 1):
+        one, other = (around[:, first : first + N_OUTLINE : 2] for first in (steps - step, steps + step))
+        reach = np.maximum(reach, np.maximum(one, other) * np.cos(_ANGLE[step]))
+    return reach
+
+
 def _quantiles(values: Float64, weight: Float64) -> tuple[float, float, float]:
-    order = np.argsort(values, kind="stable")
+    # Rounded: draws of one radius are often equal, and the last digit of a sum must not order them.
+    order = np.argsort(np.round(values, 12), kind="stable")
     middle = np.cumsum(weight[order]) - 0.5 * weight[order]
     low, centre, high = np.interp([0.05, 0.5, 0.95], middle, values[order])
     return float(low), float(centre), float(high)

@@ -15,6 +15,7 @@ from dbh_studio.core.arrays import Float64, Int64
 from dbh_studio.core.estimator.heap import LIKELY_CLUTTER, signs_of
 from dbh_studio.core.estimator.search import Rings, Search, find_rings
 from dbh_studio.core.estimator.tube import Tube
+from dbh_studio.core.medians import quantiles
 from dbh_studio.core.section import ring_coverage
 
 Beside = Literal["", "neighbour", "fork"]
@@ -188,8 +189,8 @@ def _stretch(heights: Float64) -> float:
     """Length of stem over which points are seen."""
     if len(heights) < 2:
         return 0.0
-    low, high = np.quantile(heights, [0.05, 0.95])
-    return float(high - low)
+    low, high = quantiles(heights, (0.05, 0.95))
+    return high - low
 
 
 def _other(tube: Tube, n_points: int, claim: float, main: Tube) -> OtherStem:

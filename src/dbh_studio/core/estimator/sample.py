@@ -22,7 +22,8 @@ def sample_points(points_m: Float64, n_most: int, *, seed: int) -> Int64:
     bits = np.ascontiguousarray(points_m, np.float64).view(np.uint64)
     key = np.full(len(bits), (seed * _ODD[3] + 1) & _WORD, np.uint64)
     for column, odd in enumerate(_ODD[:3]):
-        key = (key ^ bits[:, column]) * np.uint64(odd)
+        key ^= bits[:, column]
+        key *= np.uint64(odd)
         key ^= key >> np.uint64(29)
     key *= np.uint64(_ODD[3])
     key ^= key >> np.uint64(32)

@@ -6,13 +6,16 @@ of all points under "a noisy ring and, everywhere else, clutter, but hardly any 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from dbh_studio.core.arrays import Bool, Float64, Int64
+from dbh_studio.core.arrays import Bool, Float64, Int64, readonly
+from dbh_studio.core.medians import quantiles
 from dbh_studio.core.robust import circumcircles
 
 _SLICES = 5
@@ -93,8 +96,8 @@ def search_rings(points: Float64, *, widest_m: float, taper: float, rng: np.rand
     Where two thin stems touch, a wide ring round both may be likelier than either of them alone. So the two compete
     with it together.
     """
-    low, high = np.quantile(points[:, 2], [0.01, 0.99])
-    window = (max(float(low), -0.40), min(float(high), 0.50))
+    low, high = quantiles(points[:, 2], (0.01, 0.99))
+    window = (max(low, -0.40), min(high, 0.50))
     start = _starts(points, window, widest_m, rng)
     if not len(start):
         nothing = np.empty(0)
@@ -107,7 +110,7 @@ def search_rings(points: Float64, *, widest_m: float, taper: float, rng: np.rand
     sigma = np.minimum(0.025, 0.25 * start[:, 2] + 0.003)
     rings = Rings(start[:, :2], np.zeros((len(start), 2)), start[:, 2], sigma, start[:, 3])
     rings = _refined(rings, some, (0.10, 0.14, 0.2, 0.3), widest_m, taper)
-    area = _box_area(used[:, :2])
+    area = _box_area(used[:, 0], used[:, 1])
     told = _densities(rings, some, taper)
     ranked = _distinct(rings, np.argsort(-_likelihood(told, area), kind="stable"), _CANDIDATES)
     best = ranked[:_FINALISTS]
@@ -126,15 +129,18 @@ def search_rings(points: Float64, *, widest_m: float, taper: float, rng: np.rand
 
 def _distinct(rings: Rings, order: Int64, n_most: int) -> Int64:
     """The first rows of an order that are not the same ring as one before."""
-    place = np.column_stack([rings.middles(), rings.radius])
+    place = np.column_stack([rings.middles(), rings.radius])[order]
+    apart = np.abs(place[:, None] - place).sum(axis=2)
+    is_other = apart > 0.1 * np.minimum(place[:, 2, None], place[:, 2])
+    left = np.ones(len(order), bool)
     kept: list[int] = []
-    for row in order:
-        apart = np.abs(place[kept] - place[row]).sum(axis=1)
-        if (apart > 0.1 * np.minimum(place[kept, 2], place[row, 2])).all():
-            kept.append(int(row))
+    for at in range(len(order)):
+        if left[at]:
+            kept.append(at)
             if len(kept) == n_most:
                 break
-    return np.array(kept, np.int64)
+            left &= is_other[at]
+    return order[kept]
 
 
 def _starts(points: Float64, window: tuple[float, float], widest_m: float, rng: np.random.Generator) -> Float64:
@@ -168,63 +174,81 @@ def _slice_circles(xy: Float64, n_hypotheses: int, widest_m: float, rng: np.rand
     apart = (x[others] - x[first][:, None]) ** 2 + (y[others] - y[first][:, None]) ** 2
     far = apart > (_REACHES_M[np.arange(n_hypotheses) % len(_REACHES_M)] ** 2)[:, None]
     pair = np.argsort(far, axis=1, kind="stable")[:, :2]
-    second, third = np.take_along_axis(others, pair, axis=1).T
+    second, third = others[np.arange(n_hypotheses), pair.T]
     centres, radii = circumcircles(np.stack([xy[first], xy[second], xy[third]], axis=1))
     circles = np.column_stack([centres, radii])
-    circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] > _SMALLEST_M) & (circles[:, 2] < widest_m)]
+    # A radius that is finite is that of a finite centre.
+    circles = circles[(radii > _SMALLEST_M) & (radii < widest_m)]
     if not len(circles):
         return circles
     ranked = circles[np.argsort(-_slice_score(x, y, circles), kind="stable")]
-    kept = [ranked[0]]
-    for circle in ranked[1:40]:
+    # Numbers, not arrays of three: most of the time would go into taking these apart.
+    best, *rest = ranked[:40].tolist()
+    kept = [best]
+    for circle in rest:
         if all(_apart(circle, other) > 0.3 * min(circle[2], other[2]) for other in kept):
             kept.append(circle)
             if len(kept) == _KEPT_PER_SLICE:
                 break
     # And one beside the best, for it may be another stem's.
     beside = np.hypot(*(ranked[:, :2] - ranked[0, :2]).T) > _APART * (ranked[:, 2] + ranked[0, 2])
-    if beside.any() and not any(_is_beside(circle, kept[0]) for circle in kept[1:]):
-        kept[_KEPT_PER_SLICE - 1 :] = [ranked[int(beside.argmax())]]
+    if beside.any() and not any(_is_beside(circle, best) for circle in kept[1:]):
+        kept[_KEPT_PER_SLICE - 1 :] = [ranked[int(beside.argmax())].tolist()]
     return np.array(kept)
 
 
-def _apart(one: Float64, other: Float64) -> float:
-    return float(np.hypot(one[0] - other[0], one[1] - other[1]) + abs(one[2] - other[2]))
+def _apart(one: list[float], other: list[float]) -> float:
+    return math.hypot(one[0] - other[0], one[1] - other[1]) + abs(one[2] - other[2])
 
 
-def _is_beside(one: Float64, other: Float64) -> bool:
-    return bool(np.hypot(one[0] - other[0], one[1] - other[1]) > _APART * (one[2] + other[2]))
+def _is_beside(one: list[float], other: list[float]) -> bool:
+    return math.hypot(one[0] - other[0], one[1] - other[1]) > _APART * (one[2] + other[2])
 
 
 def _slice_score(x: Float64, y: Float64, circles: Float64) -> Float64:
     """(H,) support of the circles (MSAC), less the points inside, made comparable between small and large circles."""
-    dx, dy = x - circles[:, :1], y - circles[:, 1:2]
     radius = circles[:, 2:]
-    error = np.sqrt(dx * dx + dy * dy) - radius
-    area = _box_area(np.column_stack([x, y]))
+    error, off = x - circles[:, :1], y - circles[:, 1:2]
+    # In place from here on: of arrays of this size new memory costs as much as the sum.
+    error *= error
+    off *= off
+    error += off
+    np.sqrt(error, out=error)
+    error -= radius
+    area = _box_area(x, y)
     score = np.full(len(circles), -np.inf)
     for tolerance in _TOLERANCES_M:
         width = np.minimum(tolerance, 0.25 * radius + 0.004)
-        ratio = error / width
-        support = (np.maximum(1.0 - ratio * ratio, 0.0) - 0.5 * (ratio < -2.5)).sum(axis=1)
+        ratio = np.divide(error, width, out=off)
+        inside = (ratio < -2.5).sum(axis=1)
+        ratio *= ratio
+        np.subtract(1.0, ratio, out=ratio)
+        np.maximum(ratio, 0.0, out=ratio)
         rarity = 1.0 + np.log1p(area / (4 * np.pi * radius * width))[:, 0]
-        score = np.maximum(score, support * rarity)
+        score = np.maximum(score, (ratio.sum(axis=1) - 0.5 * inside) * rarity)
     return score
 
 
-def _box_area(xy: Float64) -> float:
-    low, high = np.quantile(xy, [0.04, 0.96], axis=0)
-    return float(np.prod(high - low + 0.2))
+def _box_area(x: Float64, y: Float64) -> float:
+    (west, east), (south, north) = quantiles(x, (0.04, 0.96)), quantiles(y, (0.04, 0.96))
+    return (east - west + 0.2) * (north - south + 0.2)
 
 
 def offsets(rings: Rings, points: Float64, taper: float) -> tuple[Float64, Float64, Float64, Float64]:
     """(H, N) arrays: height over the rings' own, unit vector outwards (x, y), distance to their surface."""
-    height = points[:, 2] - rings.h0[:, None]
-    dx = points[:, 0] - rings.centre[:, :1] - rings.slope[:, :1] * height
-    dy = points[:, 1] - rings.centre[:, 1:] - rings.slope[:, 1:] * height
-    distance = np.sqrt(dx * dx + dy * dy) + 1e-9
-    thinner = (0.8 * taper * np.minimum(1.0, rings.radius / 0.15))[:, None] * points[:, 2]
-    return height, dx / distance, dy / distance, distance - rings.radius[:, None] + thinner
+    x, y, z = points.T
+    height = z - rings.h0[:, None]
+    dx = x - rings.centre[:, :1] - rings.slope[:, :1] * height
+    dy = y - rings.centre[:, 1:] - rings.slope[:, 1:] * height
+    distance = dx * dx
+    distance += dy * dy
+    np.sqrt(distance, out=distance)
+    distance += 1e-9
+    dx /= distance
+    dy /= distance
+    distance -= rings.radius[:, None]
+    distance += (0.8 * taper * np.minimum(1.0, rings.radius / 0.15))[:, None] * z
+    return height, dx, dy, distance
 
 
 def _refined(rings: Rings, points: Float64, reaches: tuple[float, ...], widest_m: float, taper: float) -> Rings:
@@ -233,24 +257,36 @@ def _refined(rings: Rings, points: Float64, reaches: tuple[float, ...], widest_m
     for reach in reaches:
         now = Rings(centre, slope, radius, sigma, rings.h0)
         height, out_x, out_y, error = offsets(now, points, taper)
-        weight = np.maximum(1.0 - (error / (4.2 * sigma)[:, None]) ** 2, 0.0) ** 2
+        weight = _falling(error, (4.2 * sigma)[:, None])
+        weight *= weight
         if np.isfinite(reach):
-            weight *= np.maximum(1.0 - (height / (1.5 * reach)) ** 2, 0.0)
+            weight *= _falling(height, 1.5 * reach)
         total = weight.sum(axis=1) + 1e-9
-        sigma = np.clip(
-            1.5 * (weight * np.abs(error)).sum(axis=1) / total, 0.003, np.minimum(0.04, 0.2 * radius + 0.003)
-        )
-        step = _step(slope, sigma, weight, total, np.stack([out_x, out_y, height * out_x, height * out_y], 1), error)
-        step *= np.minimum(1.0, 0.3 * radius / (np.abs(step[:, [0, 1, 4]]).max(axis=1) + 1e-9))[:, None]
+        spread = 1.5 * np.matmul(weight[:, None], np.abs(error)[..., None])[:, 0, 0] / total
+        sigma = np.minimum(np.maximum(spread, 0.003), np.minimum(0.04, 0.2 * radius + 0.003))
+        design = np.empty((len(radius), 5, len(points)))
+        design[:, 0], design[:, 1], design[:, 4] = out_x, out_y, 1.0
+        np.multiply(design[:, :2], height[:, None], out=design[:, 2:4])
+        step = _step(slope, sigma, weight, total, design, error)
+        aside, ahead, _, _, wider = np.abs(step.T)
+        step *= np.minimum(1.0, 0.3 * radius / (np.maximum(np.maximum(aside, ahead), wider) + 1e-9))[:, None]
         centre = centre + step[:, :2]
-        slope = np.clip(slope + np.clip(step[:, 2:4], -0.25, 0.25), -0.6, 0.6)
-        radius = np.clip(radius + step[:, 4], 0.5 * _SMALLEST_M, 1.2 * widest_m)
+        tilt = np.minimum(np.maximum(step[:, 2:4], -0.25), 0.25)
+        slope = np.minimum(np.maximum(slope + tilt, -0.6), 0.6)
+        radius = np.minimum(np.maximum(radius + step[:, 4], 0.5 * _SMALLEST_M), 1.2 * widest_m)
     return Rings(centre, slope, radius, sigma, rings.h0)
 
 
-def _step(slope: Float64, sigma: Float64, weight: Float64, total: Float64, place: Float64, error: Float64) -> Float64:
-    """(H, 5) Gauss-Newton steps, with a prior of upright stems."""
-    design = np.concatenate([place, np.ones_like(place[:, :1])], axis=1)
+def _falling(distance: Float64, width: float | Float64) -> Float64:
+    """1 at zero, falling with the square of (H, N) distances to 0 at the width and beyond."""
+    weight = distance / width
+    weight *= weight
+    np.subtract(1.0, weight, out=weight)
+    return np.maximum(weight, 0.0, out=weight)
+
+
+def _step(slope: Float64, sigma: Float64, weight: Float64, total: Float64, design: Float64, error: Float64) -> Float64:
+    """(H, 5) Gauss-Newton steps from (H, 5, N) derivatives, with a prior of upright stems."""
     normal = np.matmul(design * weight[:, None], design.transpose(0, 2, 1))
     ridge = np.array([1e-4, 1e-4, 0.0, 0.0, 1e-4]) * total[:, None] + 1e-9
     ridge[:, 2:4] += (3.0 * sigma**2 / _LEAN_SD**2)[:, None]
@@ -285,7 +321,8 @@ def _densities(rings: Rings, points: Float64, taper: float) -> _Densities:
     ratio = error / sigma
     on: Bool = np.abs(ratio) < 3.0
     n_on = on.sum(axis=1)
-    sector = ((np.arctan2(out_y, out_x) + np.pi) * (_N_BINS / (2 * np.pi))).astype(np.int64) % _N_BINS
+    sector = ((np.arctan2(out_y, out_x) + np.pi) * (_N_BINS / (2 * np.pi))).astype(np.int64)
+    sector[sector == _N_BINS] = 0
     sector += _N_BINS * np.arange(len(n_on))[:, None]
     share = np.bincount(sector[on], minlength=_N_BINS * len(n_on)).reshape(-1, _N_BINS) + 0.2
     share = share / share.sum(axis=1, keepdims=True)
@@ -301,9 +338,16 @@ def _likelihood(told: _Densities, area: float) -> Float64:
     return np.where(told.n_on >= 10, np.log(share * told.ring + clutter).sum(axis=1), -np.inf)
 
 
+@lru_cache(maxsize=32)
+def _pairs(n_rings: int) -> tuple[Int64, Int64]:
+    """Rows of all pairs."""
+    one, other = np.triu_indices(n_rings, 1)
+    return readonly(one), readonly(other)
+
+
 def _best_pair(rings: Rings, told: _Densities, area: float) -> tuple[tuple[int, int] | None, float]:
     """The two rings, apart from each other, that explain the points best together, and their log-likelihood."""
-    one, other = np.triu_indices(len(rings.radius), 1)
+    one, other = _pairs(len(rings.radius))
     place = rings.middles()
     apart = np.hypot(*(place[one] - place[other]).T) > _APART * (rings.radius[one] + rings.radius[other])
     fit = apart & (np.minimum(told.n_on[one], told.n_on[other]) >= 10)

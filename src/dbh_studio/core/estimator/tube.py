@@ -10,6 +10,7 @@ There is no k = 1: it would be a shift of the section, which c already is.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,12 +44,14 @@ class Tube:
 
     def frame(self) -> tuple[Float64, Float64, Float64]:
         """Unit vectors u, v across the axis and w along it; u as near to x as can be."""
-        w = np.array([self.slope[0], self.slope[1], 1.0])
-        w /= np.sqrt(w @ w)
-        u = np.array([1.0, 0.0, 0.0]) - w[0] * w
-        u /= np.sqrt(u @ u)
-        v = np.array([w[1] * u[2] - w[2] * u[1], w[2] * u[0] - w[0] * u[2], w[0] * u[1] - w[1] * u[0]])
-        return u, v, w
+        # Numbers, not arrays of three: this is called some forty times a stem.
+        a, b = float(self.slope[0]), float(self.slope[1])
+        wz = 1.0 / math.sqrt(a * a + b * b + 1.0)
+        wx, wy = a * wz, b * wz
+        ux = math.sqrt(1.0 - wx * wx)
+        uy, uz = -wx * wy / ux, -wx * wz / ux
+        v = np.array([wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux])
+        return np.array([ux, uy, uz]), v, np.array([wx, wy, wz])
 
     def polar(self, points: Float64) -> Polar:
         """Where (N, 3) points are about the axis."""
@@ -83,23 +86,37 @@ class Polar:
 
     def part(self, mask: Bool) -> Polar:
         """Some of the points."""
-        return Polar(self.cos[mask], self.sin[mask], self.distance[mask], self.along[mask])
+        rows = np.flatnonzero(mask)  # once for all four: taking by a mask looks for them each time
+        return Polar(self.cos[rows], self.sin[rows], self.distance[rows], self.along[rows])
 
     def design(self, highest: int) -> Float64:
         """(4 + 2 highest, N) derivatives of r by shift (2), tilt (2), radius, taper and waves."""
-        tilt = (self.along * self.cos, self.along * self.sin)
-        ring = (np.ones_like(self.cos), -self.along)
-        place = np.stack([self.cos, self.sin, *tilt, *ring])
-        return np.concatenate([place, wave_basis(self.cos, self.sin, highest)])
+        design = np.empty((N_PLACE + 2 * highest, len(self.cos)))
+        design[0], design[1] = self.cos, self.sin
+        np.multiply(self.along, design[:2], out=design[2:4])
+        design[4] = 1.0
+        np.negative(self.along, out=design[5])
+        wave_basis(self.cos, self.sin, highest, out=design[6:])
+        return design
 
 
-def wave_basis(cos: Float64, sin: Float64, highest: int) -> Float64:
-    """(2 (highest - 1), ...) cos 2t, sin 2t, cos 3t, … from the cosine and sine of t, without further trigonometry."""
-    waves, c, s = [], cos, sin
-    for _ in range(2, highest + 1):
-        c, s = c * cos - s * sin, s * cos + c * sin
-        waves += [c, s]
-    return np.array(waves) if waves else np.empty((0, *cos.shape))
+def wave_basis(cos: Float64, sin: Float64, highest: int, *, out: Float64 | None = None) -> Float64:
+    """(2 (highest - 1), ...) cos 2t, sin 2t, cos 3t, … from the cosine and sine of t, without further trigonometry.
+
+    Args:
+        cos: Of t.
+        sin: Of t.
+        highest: The last wave.
+        out: Where to put them.
+    """
+    waves = np.empty((max(2 * (highest - 1), 0), *cos.shape)) if out is None else out
+    turn = np.empty(cos.shape, np.complex128)
+    turn.real, turn.imag = cos, sin
+    power = turn.copy()
+    for row in range(0, len(waves), 2):
+        power *= turn
+        waves[row], waves[row + 1] = power.real, power.imag
+    return waves
 
 
 def cells_of(angle: Float64, along: Float64, radius: float, n_points: float) -> tuple[Int64, int]:
@@ -109,9 +126,10 @@ def cells_of(angle: Float64, along: Float64, radius: float, n_points: float) -> 
     and not a point is what counts. Patches are 5 × 10 cm, larger where points are few.
     """
     most = 2 * np.pi * radius / _CELL_M * 10.0
-    coarse = float(np.clip(np.sqrt(_POINTS_PER_CELL * most / max(n_points, 1.0)), 1.0, 3.0))
-    n_around = int(np.clip(round(2 * np.pi * radius / (_CELL_M * coarse)), 16, 72))
-    around = np.floor((angle + np.pi) * (n_around / (2 * np.pi))).astype(np.int64) % n_around
+    coarse = min(max(math.sqrt(_POINTS_PER_CELL * most / max(n_points, 1.0)), 1.0), 3.0)
+    n_around = min(max(round(2 * np.pi * radius / (_CELL_M * coarse)), 16), 72)
+    around = ((angle + np.pi) * (n_around / (2 * np.pi))).astype(np.int64)
+    around[around == n_around] = 0
     layer = np.floor(along / (_LAYER_M * coarse)).astype(np.int64)
     layer -= layer.min(initial=0)
     key = layer * n_around + around
