@@ -124,6 +124,7 @@ def test_a_file_is_no_folder_and_thin_stems_are_told(saved, tmp_path, capsys):
     succeeds(capsys, saved, "--out", tmp_path / "thin", "--format", "report", "--least-dbh", 90)
     text = (tmp_path / "thin" / "stand_report.html").read_text("utf-8")
     assert f"Stems thinner than 90.0 cm are not in this table: {len(STEMS)} of those inside" in text
+    assert "<td>command line</td>" in text  # who made the plot: not whoever is signed in to the computer
     assert f"<dt>Counted</dt><dd>0 of {len(STEMS)} stems" in text
 
 

@@ -208,6 +208,22 @@ def test_interrupted_it_ends_politely_and_goes_on_later(plot, tmp_path, capsys):
 # ---- run --masks
 
 
+def test_a_run_goes_on_where_the_cache_cannot_be_written(plot, cache, tmp_path, capsys, monkeypatch, caplog):
+    # In the place of the folder for masks is a file: nobody can write there, whoever runs the tests.
+    nowhere = tmp_path / "cache"
+    nowhere.mkdir()
+    shutil.copytree(cache / "models", nowhere / "models")
+    (nowhere / "unsaved-masks").touch()
+    (nowhere / "unsaved-votes").touch()
+    monkeypatch.setenv("DBH_STUDIO_CACHE", str(nowhere))
+    photos = ["--cameras", plot.poses, "--images", plot.folder / "images", "--scale", 0.37]
+    making = ["--keyframes", 3, "--tiles", 4, "--threads", 1]
+    out, _ = runs(capsys, "run", plot.cloud, "--out", tmp_path, *photos, "--masks", "auto", *making, "--json")
+    assert any(note.startswith("Masks made: 3, ") for note in json.loads(out)["notes"])
+    assert sum("masks are kept for this run only" in record.message for record in caplog.records) == 1
+    assert len(MaskStore(tmp_path / "plot.dbh" / "masks")) == 3
+
+
 def test_a_run_takes_the_ladder_and_the_next_one_what_is_kept(plot, tmp_path, capsys):
     photos = ["--cameras", plot.poses, "--images", plot.folder / "images", "--scale", 0.37]
     making = ["--keyframes", 3, "--tiles", 4, "--threads", 1]

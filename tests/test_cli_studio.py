@@ -244,7 +244,7 @@ def test_ending_the_studio_tells_that_the_last_change_could_not_be_saved(monkeyp
     saved = []
 
     class Session:
-        saver = None
+        saver, read_only_note = None, ""
 
         def flush(self):
             saved.append("tried")

@@ -13,6 +13,7 @@
     ├── ModelError                  a trained model is absent, cannot be fetched, or is another than it should be
     ├── ProjectError                the saved plot
     │   ├── ProjectLockedError      another process is writing it
+    │   ├── ProjectUnwritableError  nothing can be written in its folder
     │   ├── ProjectExistsError      there is one already, and it may hold edits
     │   ├── ProjectMismatchError    its trunks are those of another cloud
     │   └── ProjectVersionError     written by a newer program
@@ -56,7 +57,7 @@ class FileError(StudioError):
         self.path = Path(path)
 
     def __str__(self) -> str:
-        return f"{self.path.name}: {self.problem} {self.remedy}".strip()
+        return f"{self.path.name or self.path}: {self.problem} {self.remedy}".strip()
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.path, self.problem, self.remedy)
@@ -104,6 +105,10 @@ class ProjectError(StudioError):
 
 class ProjectLockedError(ProjectError):
     """Another process is writing this plot."""
+
+
+class ProjectUnwritableError(ProjectError):
+    """Nothing can be written where the plot lies."""
 
 
 class ProjectExistsError(ProjectError):

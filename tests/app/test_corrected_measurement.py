@@ -195,13 +195,15 @@ def test_a_new_scale_leaves_a_ring_where_it_was_drawn():
         ([(1.3, 1.8, 1.3), (1.7, 2.2, 1.3), (1.7, 1.8, 1.3), (1.3, 2.2, 1.3)], "crosses itself"),
         ([(1.3, 1.8, 1.3), (1.7, 1.8, 1.3), (1.5, 1.801, 1.3)], "a line"),
         ([(1.5, 2.0, 1.3), (1.505, 2.0, 1.3), (1.5, 2.005, 1.3)], "outside"),
+        (2 * [(1.3, 1.8, 1.3), (1.7, 1.8, 1.3), (1.7, 2.2, 1.3), (1.3, 2.2, 1.3)], "more than once"),
+        ([(4.3, 1.8, 1.3), (4.7, 1.8, 1.3), (4.7, 2.2, 1.3), (4.3, 2.2, 1.3)], "beside the stem"),
     ],
 )
 def test_a_ring_that_is_no_stem_is_refused_and_stays_said(ring, word):
     session = plot()
     correct(session, 1, "ring", tuple(ring))
     result = session.measurement(1).result
-    assert not result and word in result.reason and "again" in result.remedy
+    assert not result and word in result.reason and ("again" in result.remedy or "own points" in result.remedy)
     assert session.inventory().rows[0].corrections == "ring"
 
 
@@ -217,6 +219,64 @@ def test_a_ring_gives_a_diameter_where_there_are_no_points():
     assert result.quality == "poor" and result.section.coverage_deg == 0
     row = session.inventory().rows[0]
     assert row.rmse_mm is None and row.n_points == 0 and row.corrections == "left_out;ring"
+
+
+def test_a_ring_round_the_second_stem_of_a_trunk_is_measured():
+    session = plot()
+    both = TrunkSet.from_point_sets([np.concatenate(STEM_POINTS[:2]), STEM_POINTS[2]])
+    session.do(commands.replace_trunks(both))
+    trunk_id = max(session.document.trunks, key=len).id
+    for stem, (_, _, diameter_m) in enumerate(STEMS[:2], 1):
+        correct(session, trunk_id, "ring", circle(session, stem, z_m=1.3, diameter_m=diameter_m))
+        assert session.measurement(trunk_id).result.dbh_cm == pytest.approx(100 * diameter_m, rel=0.01)
+
+
+def test_a_ring_of_a_stem_without_any_point_is_refused_with_what_to_do():
+    session = plot()
+    correct(session, 1, "left_out", tuple(session.document.trunks[1].points.tolist()))
+    correct(session, 1, "ring", circle(session, 1, z_m=1.3, diameter_m=0.30))
+    result = session.measurement(1).result
+    assert result.code == "no_points" and "left out by hand" in result.reason and "Withdraw" in result.remedy
+    row = session.inventory().rows[0]
+    assert row.dbh_cm is None and row.quality == "refused"
+
+
+def half_seen() -> Session:
+    """The plot, which asks for more of a ring than was seen of the first stem."""
+    session = plot()
+    trunk = session.document.trunks[1]
+    away = trunk.points[session.cloud.xyz[trunk.points, 0] > np.median(session.cloud.xyz[trunk.points, 0]) + 0.02]
+    correct(session, 1, "left_out", tuple(away.tolist()))
+    session.do(commands.change_settings("measure", min_coverage_deg=250.0))
+    return session
+
+
+def test_an_arc_that_a_person_accepts_gives_a_diameter_that_says_so():
+    session = half_seen()
+    assert session.measurement(1).result.code == "small_arc"
+    others = [session.measurement(i).result.flag_codes for i in (2, 3)]
+    correct(session, 1, "least_arc", 120.0)
+    result = session.measurement(1).result
+    assert result.dbh_cm == pytest.approx(30.0, rel=0.03) and result.interval is not None
+    assert result.flag_codes[-1] == "arc_accepted" and "by hand" in result.flags[-1]
+    assert [session.measurement(i).result.flag_codes for i in (2, 3)] == others
+    row = session.inventory().rows[0]
+    assert row.corrections == "least_arc;left_out" and "arc_accepted" in row.flags
+    # A plot that is content with less needs nobody's word for it.
+    session.do(commands.change_settings("measure", min_coverage_deg=90.0))
+    assert "arc_accepted" not in session.measurement(1).result.flag_codes
+    session.do(commands.withdraw_correction(1, "least_arc"))
+    session.do(commands.change_settings("measure", min_coverage_deg=250.0))
+    assert session.measurement(1).result.code == "small_arc"
+
+
+def test_an_arc_that_was_accepted_is_measured_in_a_job_as_here():
+    session = half_seen()
+    correct(session, 1, "least_arc", 120.0)
+    here = session.measurement(1).result
+    other = Session(session.cloud, session.document)
+    other.remember_measurements(other.document, measure_stems(*measurement_call(other, other.document)))
+    assert other.unmeasured() == () and other.measurement(1).result.flag_codes == here.flag_codes
 
 
 def test_a_job_measures_as_the_session_does():

@@ -76,6 +76,26 @@ def test_a_line_drawn_between_two_stems_parts_them(session):
         split_by_plane(session, 9, (0, 0, 0), (1, 0, 0))
 
 
+@pytest.mark.parametrize(
+    ("first", "last"), [((0.6, -1.0), (1.6, 1.0)), ((0.6, 1.5), (1.6, 1.5)), ((-3.0, -1.0), (-0.6, 1.0))]
+)
+def test_a_line_drawn_beside_a_stem_does_not_cut_it(session, first, last):
+    x, y, _ = STEMS[0]
+    view = View.looking_at((x, y - 10, 2.0), (x, y, 2.0))
+
+    def ends(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+        return view.project(np.array([[x + across, y, 2.0 + up] for across, up in (low, high)]))
+
+    document = session.document
+    for line in (ends(first, last), ends(last, first)):
+        with pytest.raises(CommandError, match="does not cross trunk 1"):
+            split_by_line(session, 1, view, *line)
+    assert session.document is document
+    # On across the stem, to the other side, it cuts.
+    session.do(split_by_line(session, 1, view, *ends((-0.6, -0.3), (0.6, 0.3))))
+    assert len(session.document.trunks) == 3
+
+
 def test_stems_are_parted_and_measured_apart(session):
     session.do(split_by_stems(session, 2))
     found = {}

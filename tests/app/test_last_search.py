@@ -26,6 +26,7 @@ from dbh_studio.app.search_report import check_report, search_report, write_sear
 from dbh_studio.cli import main
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.trunks import TrunkSet
 from dbh_studio.errors import CommandError, FileError, SettingError, StaleResultError
 from dbh_studio.io.las import write_las
 
@@ -242,3 +243,22 @@ def test_the_command_line_writes_it_beside_the_inventory(las, tmp_path, capsys):
     assert json.loads(out.read_text(encoding="utf-8"))["settings"]["trunks"]["small_clusters"] == "otsu"
     assert main([*arguments, "--name", "again"]) == 1
     assert "already" in capsys.readouterr().err
+
+
+def test_steps_of_a_plot_that_was_never_searched_are_refused_before_the_work(las, tmp_path, capsys, monkeypatch):
+    session = open_plot(las, project_dir=tmp_path / "plot.dbh")
+    session.do(commands.replace_trunks(TrunkSet.from_point_sets([np.arange(500)])))
+    session.close()
+
+    def no_work(*_, **__):
+        raise AssertionError("trees are measured all the same")
+
+    monkeypatch.setattr("dbh_studio.app.session.Session.inventory", no_work)
+    arguments = ["run", "--out", str(tmp_path), "--steps", str(tmp_path / "steps.json"), "--quiet"]
+    assert main([*arguments, str(tmp_path / "plot.dbh")]) == 1
+    told = capsys.readouterr().err
+    assert "not searched for" in told and "dbh-studio run" in told
+    # Trees that the file itself tells apart are not searched for, either.
+    assert main([*arguments, str(las), "--name", "again"]) == 1
+    assert "trunks.use_existing_ids=false" in capsys.readouterr().err
+    assert not (tmp_path / "steps.json").exists() and not (tmp_path / "again.dbh").exists()

@@ -14,10 +14,14 @@ from tests.app.random_edits import N_POINTS, of, random_step
 from tests.app.test_undo_saving import abandon
 
 from dbh_studio.app import commands
-from dbh_studio.app.opening import open_plot
+from dbh_studio.app.autosave import AUTHOR_VARIABLE
+from dbh_studio.app.opening import open_or_read, open_plot, save_as
 from dbh_studio.core.corrections import Correction
-from dbh_studio.errors import CommandError
+from dbh_studio.errors import CommandError, FileError, ProjectUnwritableError
+from dbh_studio.io.lock import lock_file
+from dbh_studio.io.masks import MaskRecipe, MaskStore, TrunkMask
 from dbh_studio.io.ply import write_ply
+from dbh_studio.io.project import read_history, read_project
 
 
 def write_cloud(folder: Path) -> Path:
@@ -105,6 +109,79 @@ def test_a_cloud_that_was_moved_keeps_what_can_be_undone(tmp_path):
     last.close()
 
 
+def no_writing(monkeypatch, folder):
+    """Nothing can be written in a folder; who runs the tests may be allowed everything."""
+
+    def lock(path):
+        if path.parent == folder:
+            raise PermissionError(13, "Permission denied")
+        return lock_file(path)
+
+    monkeypatch.setattr("dbh_studio.io.project.lock_file", lock)
+
+
+def test_a_plot_that_cannot_be_written_is_read_and_goes_on_in_a_copy(tmp_path, monkeypatch):
+    path, folder = write_cloud(tmp_path), tmp_path / "plot.dbh"
+    session = open_plot(path, scale="metres", project_dir=folder)
+    session.do(commands.replace_trunks(make_trunks(5)))
+    session.close()
+    MaskStore(folder / "masks").put("a.jpg", path, TrunkMask(np.ones((2, 4), np.uint16)), MaskRecipe("painted"))
+    before = {each: each.read_bytes() for each in folder.rglob("*") if each.is_file()}
+    no_writing(monkeypatch, folder)
+    with pytest.raises(ProjectUnwritableError, match="cannot be written"):
+        open_plot(folder)
+    session = open_or_read(folder)
+    assert session.is_read_only and session.document.trunks.ids == (1, 2, 3, 4, 5)
+    assert "Permission denied" in session.reopening_notes[0] and "Save a copy" in session.reopening_notes[0]
+    with pytest.raises(CommandError, match=r"reading only.*copy"):
+        session.do(commands.delete_trunk(1))
+    save_as(session, tmp_path / "copy.dbh")
+    assert session.reopening_notes == ()
+    session.do(commands.delete_trunk(1))
+    session.close()
+    # Who did what is told in the copy, too.
+    done = [(entry.what, entry.number) for entry in read_history(tmp_path / "copy.dbh")]
+    assert done[:-2] == [(entry.what, entry.number) for entry in read_history(folder)] != []
+    assert done[-1] == ("Delete trunk 1", done[-3][1] + 1)
+    assert {each: each.read_bytes() for each in folder.rglob("*") if each.is_file()} == before
+    assert len(MaskStore(tmp_path / "copy.dbh" / "masks")) == 1
+    again = open_plot(tmp_path / "copy.dbh")
+    assert again.document.trunks.ids == (2, 3, 4, 5) and again.reopening_notes == ()
+    again.undo()
+    assert again.document.trunks.ids == (1, 2, 3, 4, 5)
+    again.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="who runs the tests may write everything")
+def test_files_that_can_be_written_in_a_folder_that_cannot_are_not_begun_with(tmp_path):
+    path, folder = write_cloud(tmp_path), tmp_path / "plot.dbh"
+    open_plot(path, scale="metres", project_dir=folder).close()
+    folder.chmod(0o555)
+    try:
+        with pytest.raises(ProjectUnwritableError):
+            open_plot(folder)
+    finally:
+        folder.chmod(0o755)
+
+
+def test_masks_that_cannot_be_brought_along_do_not_make_a_save_look_failed(tmp_path, monkeypatch, caplog):
+    path = write_cloud(tmp_path)
+    session = open_plot(path, scale="metres", project_dir=tmp_path / "plot.dbh")
+    session.do(commands.replace_trunks(make_trunks(5)))
+
+    def fails(before, after, **_):
+        raise FileError(after, "The disk is full.", "Make room.")
+
+    monkeypatch.setattr("dbh_studio.app.opening.carry_masks", fails)
+    save_as(session, tmp_path / "copy.dbh")
+    (note,) = session.reopening_notes
+    assert "saved in copy.dbh" in note and "The disk is full" in note and str(tmp_path / "plot.dbh" / "masks") in note
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    session.do(commands.delete_trunk(1))
+    session.close()
+    assert read_project(tmp_path / "copy.dbh").trunks.ids == (2, 3, 4, 5)
+
+
 def test_a_plot_open_for_reading_shows_the_last_edit_and_writes_nothing(tmp_path):
     path, folder = write_cloud(tmp_path), tmp_path / "plot.dbh"
     session = open_plot(path, scale="metres", project_dir=folder)
@@ -119,3 +196,17 @@ def test_a_plot_open_for_reading_shows_the_last_edit_and_writes_nothing(tmp_path
     beside.close()
     assert {each.name: each.read_bytes() for each in folder.iterdir() if each.is_file()} == before
     session.close()
+
+
+def test_commands_sign_as_such_unless_somebody_is_named(tmp_path, monkeypatch):
+    path, folder = write_cloud(tmp_path), tmp_path / "plot.dbh"
+    monkeypatch.delenv(AUTHOR_VARIABLE, raising=False)
+    monkeypatch.setattr("dbh_studio.app.autosave.user_name", lambda: "root")
+    for name, is_command, expected in (("", True, "command line"), ("", False, "root"), (" Ada ", True, "Ada")):
+        if name:
+            monkeypatch.setenv(AUTHOR_VARIABLE, name)
+        session = open_plot(path, scale="metres", project_dir=folder, background_save=not is_command)
+        session.do(commands.rename_plot(f"as {expected}"))
+        assert session.author == expected
+        session.close()
+        assert read_history(folder)[-1].who == expected

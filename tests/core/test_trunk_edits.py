@@ -7,7 +7,7 @@ import pytest
 from tests.app.plots import trunk
 
 from dbh_studio.core.picking import PickCloud, View
-from dbh_studio.core.trunk_edits import beyond_plane, grown, in_order, owners, plane_of_line, shrunk
+from dbh_studio.core.trunk_edits import beyond_plane, grown, in_order, n_beside_line, owners, plane_of_line, shrunk
 
 FAR = np.array([500_000.0, 4_500_000.0, 100.0])
 
@@ -35,6 +35,19 @@ def test_a_drawn_line_cuts_where_it_is_seen():
     assert (beyond == right).all()
     with pytest.raises(ValueError, match="short"):
         plane_of_line(view, (0.5, 0.5), (0.5, 0.5))
+
+
+def test_what_is_beside_a_line_is_counted_between_its_ends_only():
+    view = View.looking_at((0, -5, 0), (0, 0, 0), aspect=1.6)
+    # Along a line that goes up to the right at 45 degrees; the last point is behind the camera.
+    places = np.array([[0.1, 0, -0.1], [-0.1, 0, 0.1], [-0.1, 0, 0.2], [2.0, 0, 1.9], [-2.0, 0, -1.9], [0, -9, 0]])
+    ends = view.project(np.array([[-1.0, 0, -1.0], [1.0, 0, 1.0]]))
+    assert sorted(n_beside_line(view, places, *ends)) == [1, 2]
+    assert n_beside_line(view, places, *ends) == n_beside_line(view, places, *ends[::-1])[::-1]
+    steep = view.project(np.array([[1.4, 0, 0.4], [0.4, 0, 1.4]]))  # square to it, beyond all but one of them
+    assert sorted(n_beside_line(view, places, *steep)) == [1, 4]
+    short = view.project(np.array([[1.0, 0, 0.5], [1.1, 0, 0.6]]))  # points at them from beside
+    assert n_beside_line(view, places, *short) == (0, 0)
 
 
 def test_growing_takes_what_is_free_and_near():

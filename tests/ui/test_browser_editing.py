@@ -272,6 +272,28 @@ def test_delete_held_down_takes_the_points_off_and_leaves_the_trunk(page: Any, s
     assert tree in session.document.trunks
 
 
+def test_the_second_press_of_a_double_click_is_none_on_what_has_come_to_lie_there(page: Any, studio: Studio) -> None:
+    tree = session_of(studio).document.trunks.ids[0]
+    choose_by_click(page, studio, tree)
+    take(page, studio, "click", "1")
+    sent = page.evaluate(
+        """() => {
+          const kept = window.dbh, sent = [];
+          window.dbh = (kind, payload) => sent.push(payload[0]);
+          const press = (what, x) => document.querySelector(`#dbh-edit [data-edit=${what}]`).dispatchEvent(
+            new MouseEvent('click', {detail: 1, clientX: x, clientY: 50, bubbles: true}));
+          press('grow', 50);
+          press('delete', 52);
+          press('delete', 52);
+          press('split', 200);
+          press('split', 200);
+          window.dbh = kept;
+          return sent;
+        }"""
+    )
+    assert sent == ["grow", "split", "split"]
+
+
 def test_the_brush_follows_the_pointer_and_the_view_stays(page: Any, studio: Studio) -> None:
     session = session_of(studio)
     tree = session.document.trunks.ids[0]

@@ -258,6 +258,27 @@ def test_a_refused_tree_is_given_a_number_from_its_card(page: Any, studio: Studi
     assert isinstance(session.measurement(trunk_id).result, DbhEstimate)
 
 
+def test_what_is_typed_in_a_card_outlives_its_redrawing(page: Any, studio: Studio) -> None:
+    session = studio.session
+    assert session is not None
+    trunk_id = rows(page)[1]
+    session.do(commands.correct_measurement(trunk_id, Correction("breast_height", 19.5)))
+    page.click(f".dbh-trees tr[data-id='{trunk_id}']")
+    page.wait_for_selector(".dbh-tape input")
+    browser.settle(page, studio)
+    page.locator(".dbh-tape input").press_sequentially("33")
+    page.evaluate("window.oldField = document.querySelector('.dbh-tape input')")
+    session.do(commands.correct_measurement(trunk_id, Correction("breast_height", 19.6)))
+    page.wait_for_function("!window.oldField.isConnected && document.querySelector('.dbh-tape input')")
+    browser.settle(page, studio)
+    page.keyboard.type(".5")  # as one who has noticed nothing
+    assert page.input_value(".dbh-tape input") == "33.5"
+    page.keyboard.press("Enter")
+    page.wait_for_selector("[data-correction=tape]")
+    page.wait_for_function("document.querySelector('.dbh-tape input').value === ''")
+    assert session.document.record(trunk_id).correction("tape") == 33.5
+
+
 def test_one_press_of_space_is_one_decision_and_none_is_made_while_one_draws(page: Any, studio: Studio) -> None:
     session = studio.session
     assert session is not None

@@ -104,6 +104,51 @@ def test_a_lasso_selects_points_of_the_tree_and_takes_them_off(tab, studio):
     tab.wait(lambda t: len(studio.session.document.trunks[tree]) == n_own and f"{before:.1f} cm" in bar(t)["effect"])
 
 
+DELETE = "Correct: take the selected points off, or delete the trunk"
+
+
+def test_delete_pressed_once_more_takes_points_off_and_leaves_the_trunk(tab, studio):
+    tree = first(studio)
+    n_own = len(studio.session.document.trunks[tree])
+    select_upper(tab, studio, tree)
+    for _ in range(3):
+        tab.command(DELETE)
+    tab.wait(lambda t: f"To delete tree {tree} itself" in bar(t)["note"])
+    tab.settle()
+    assert 0 < len(studio.session.document.trunks[tree]) < n_own
+    assert f"Tree {tree}:" in bar(tab)["effect"]  # what the first press did is still said
+    # Selected with the lasso, taken off with Click in hand: the same.
+    select_upper(tab, studio, tree)
+    ask(tab, "tool", "click")
+    tab.wait(lambda t: bar(t)["tool"] == "click")
+    n_own = len(studio.session.document.trunks[tree])
+    for _ in range(3):
+        tab.command(DELETE)
+    tab.wait(lambda t: f"To delete tree {tree} itself" in bar(t)["note"])
+    tab.settle()
+    assert 0 < len(studio.session.document.trunks[tree]) < n_own
+    # Chosen again, it is what is meant.
+    tab.bridge_send("row", tree)
+    tab.command(DELETE)
+    tab.wait(lambda t: f"Tree {tree} is gone" in bar(t)["effect"])
+    tab.command("Undo")
+    tab.wait(lambda _: tree in studio.session.document.trunks)
+
+
+def test_delete_with_a_tool_in_hand_that_found_no_points_leaves_the_trunk(tab, studio):
+    tree = first(studio)
+    for tool in ("lasso", "plane"):
+        ask(tab, "tool", tool)
+        tab.wait(lambda t, tool=tool: bar(t)["tool"] == tool)
+        tab.command(DELETE)
+        tab.wait(lambda t: f"To delete tree {tree} itself" in bar(t)["note"])
+        tab.settle()
+        assert tree in studio.session.document.trunks
+    ask(tab, "tool", "click")
+    tab.command(DELETE)
+    tab.wait(lambda t: f"Tree {tree} is gone" in bar(t)["effect"])
+
+
 def test_shift_adds_alt_takes_and_escape_clears(tab, studio):
     tree = first(studio)
     points = points_of(studio, tree)
@@ -329,7 +374,7 @@ def test_what_cannot_be_done_is_said_with_what_to_do(tab, studio):
     ask(tab, "tool", "line")
     tab.wait(lambda t: bar(t).get("draws"))
     draw(tab, "line", [[0.01, 0.2], [0.02, 0.8]])
-    tab.wait_notification(f"The cut leaves all of trunk {tree} on one side")
+    tab.wait_notification(f"The line does not cross trunk {tree}")
     ask(tab, "tool", "lasso")
     tab.wait(lambda t: bar(t)["tool"] == "lasso")
     draw(tab, "lasso", [[0.01, 0.01], [0.03, 0.01], [0.02, 0.03]])

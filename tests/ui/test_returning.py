@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import IO
 
 import plots
 import pytest
@@ -12,6 +13,7 @@ from panel import LONG, choose, idle, table_ids
 from test_studio_mishaps import fill_disk
 
 from dbh_studio.app import commands
+from dbh_studio.io.lock import lock_file
 from dbh_studio.io.project import ProjectWriter, read_project
 from dbh_studio.ui.studio import Studio
 
@@ -133,6 +135,44 @@ def test_a_plot_that_another_program_writes_is_opened_for_reading_and_says_by_wh
             assert studio.session.is_read_only
     finally:
         writer.close()
+
+
+def test_a_plot_that_cannot_be_written_is_opened_and_goes_on_in_a_copy(
+    studio: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plots.measured_session(tmp_path).close()
+    folder = tmp_path / "plot.dbh"
+
+    def lock(path: Path) -> IO[str]:
+        if path.parent == folder:
+            raise PermissionError(13, "Permission denied")
+        return lock_file(path)
+
+    monkeypatch.setattr("dbh_studio.io.project.lock_file", lock)
+    with FakeClient(studio.server.url) as tab:
+        tab.wait_text("Open a point cloud")
+        assert not tab.has("Save a copy")
+        tab.set("File or folder", str(folder))
+        tab.press("Open")
+        assert "“Save a copy”" in tab.wait_notification("plot was opened", LONG).body
+        tab.wait_text("open for reading only, its folder cannot be written")
+        idle(tab, studio)
+        trunk_id = table_ids(tab)[0]
+        choose(tab, trunk_id)
+        # What is typed is not lost in silence.
+        tab.set("Note", "a fork")
+        choose(tab, table_ids(tab)[1])
+        tab.wait_notification("What was typed about the tree was not kept")
+        tab.bridge_send("step", "open")
+        tab.wait(lambda t: t.has("Save a copy") and t.value("Save in").endswith("plot.dbh"))
+        tab.set("Save in", str(tmp_path / "elsewhere" / "copy"))
+        tab.press("Save a copy")
+        tab.wait_text("saved in copy.dbh", LONG)
+        tab.wait(lambda t: not t.has("Save a copy"))
+        studio.session.do(commands.delete_trunk(trunk_id))
+        studio.session.flush()
+    assert trunk_id not in read_project(tmp_path / "elsewhere" / "copy.dbh").trunks
+    assert trunk_id in read_project(folder).trunks
 
 
 def test_how_a_plot_was_found_is_told_once_and_stays_in_the_first_step(studio: Studio, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from fakeclient import FakeClient
 from panel import LONG, choose, table_ids
 
 from dbh_studio.app import commands
+from dbh_studio.app.section_edits import drawn_points
 from dbh_studio.core.corrections import Correction
 from dbh_studio.core.dbh import DbhEstimate, Refusal
 from dbh_studio.core.measured import Diameter
@@ -57,6 +58,38 @@ def test_space_begins_with_the_worst_accepts_and_goes_on(measured: FakeClient, s
     assert review.decision == "accepted" and review.dbh_cm == pytest.approx(dbh(studio, ids[2]))
     assert review.who == studio.session.author and review.when
     assert studio.session.undo_label == f"Review trunk {ids[2]}"
+
+
+def test_undo_of_a_decision_shows_the_tree_it_was_about(measured: FakeClient, studio: Studio) -> None:
+    ids = table_ids(measured)
+    n_good = sum(studio.session.measurement(i).result.quality == "good" for i in ids)
+    (tab,) = studio._tabs.values()
+
+    def shows(t: FakeClient, trunk_id: int) -> bool:
+        return f'dbh-card" data-tree="{trunk_id}"' in t.html()
+
+    choose(measured, ids[1])
+    measured.command("Accept and go on")
+    measured.wait(lambda t: "1 of" in t.text() and not shows(t, ids[1]))
+    measured.command("Undo")
+    measured.wait(lambda t: shows(t, ids[1]) and "0 of" in t.text())
+    # Several that were chosen are chosen again.
+    measured.bridge_send("row-add", ids[3])
+    measured.wait_text("these 2")
+    measured.command("Accept and go on")
+    measured.wait(lambda t: "2 of" in t.text() and "these 2" not in t.text())
+    measured.command("Undo")
+    measured.wait(lambda t: shows(t, ids[1]) and "these 2" in t.text())
+    assert tab.view.chosen == (ids[1], ids[3])
+    # Those that nobody had chosen are not.
+    choose(measured, ids[2])
+    measured.wait(lambda t: shows(t, ids[2]))
+    measured.bridge_send("review-good")
+    measured.wait_text(f"{n_good} of {len(ids)} reviewed")
+    measured.command("Undo")
+    measured.wait_text(f"0 of {len(ids)} reviewed")
+    measured.settle()
+    assert tab.view.chosen == (ids[2],)
 
 
 def test_space_in_another_step_decides_nothing(measured: FakeClient, studio: Studio) -> None:
@@ -114,9 +147,9 @@ def test_a_decision_goes_stale_when_its_number_moves_and_says_so(measured: FakeC
 NONSENSE = [
     ("review", {"a": 1}), ("review", "drop"), ("review-filter", "every"), ("review-filter", 3), ("row-add", "x"),
     ("row-range", -1), ("sort", "rank"), ("withdraw", "all"), ("height-set", [1]), ("height-set", ["1", 2]),
-    ("height-set", [1, "2"]), ("tape", [None, None]), ("tape", 3), ("attribute", ["edited", "x"]),
-    ("attribute", "species"), ("split-stems", True), ("section-draw", None), ("section-draw", ["out", 1, 1]),
-    ("section-draw", ["erase", 1, 1, []]),
+    ("height-set", [1, "2"]), ("tape", [None, None]), ("tape", 3), ("tape-typed", 3), ("attribute", ["edited", "x"]),
+    ("attribute", "species"), ("split-stems", True), ("accept-arc", None), ("section-draw", None),
+    ("section-draw", ["out", 1, 1]), ("section-draw", ["erase", 1, 1, []]),
 ]  # fmt: skip
 
 
@@ -324,6 +357,24 @@ def test_a_tape_value_that_was_typed_is_kept_when_one_goes_on(measured: FakeClie
     assert not studio.session.document.record(third).corrections
 
 
+def test_a_tape_value_typed_in_the_card_is_kept_when_one_goes_on(measured: FakeClient, studio: Studio) -> None:
+    first, second = table_ids(measured)[:2]
+    studio.session.do(commands.correct_measurement(first, Correction("breast_height", 19.5)))
+    choose(measured, first)
+    measured.bridge_send("tape-typed", [second, "50"])  # of a tree that is no longer shown
+    measured.bridge_send("tape-typed", [first, "31.5"])
+    measured.wait(lambda t: t.value("Tape") == "31.5")
+    choose(measured, second)
+    measured.wait(lambda t: t.value("Tape") == "")
+    assert studio.session.document.record(first).correction("tape") == 31.5
+    assert studio.session.document.record(second).corrections == ()
+    choose(measured, first)
+    measured.bridge_send("tape-typed", [first, "32"])
+    measured.bridge_send("tape", [first, "32"])
+    measured.wait(lambda t: said(t, "Tape 32.0 cm"))
+    measured.wait(lambda t: t.value("Tape") == "" and "dbhCard.forget()" in t.javascript)
+
+
 def test_with_several_chosen_it_is_said_which_one_is_corrected(measured: FakeClient, studio: Studio) -> None:
     first, second = table_ids(measured)[:2]
     choose(measured, first)
@@ -419,6 +470,36 @@ def test_a_refused_tree_is_measured_where_the_profile_says_it_can_be(measured: F
     # That of the plot is no correction.
     measured.bridge_send("height-set", [trunk_id, 1.3])
     measured.wait(lambda _: not studio.session.document.record(trunk_id).corrections, LONG)
+
+
+def test_a_smaller_arc_is_accepted_where_it_gives_a_diameter(measured: FakeClient, studio: Studio) -> None:
+    trunk_id = table_ids(measured)[0]
+    session = studio.session
+    whole = session.document
+    section = session.measurement(trunk_id).result.section
+
+    def leave_out(beyond_m: float) -> None:
+        box = [[beyond_m, -5.0], [5.0, -5.0], [5.0, 5.0], [beyond_m, 5.0]]
+        away = drawn_points(session, whole, trunk_id, section, box)
+        session.do(commands.correct_measurement(trunk_id, Correction("left_out", tuple(away.tolist()))))
+
+    leave_out(0.0)
+    session.do(commands.change_settings("measure", min_coverage_deg=300.0))
+    refused = session.measurement(trunk_id).result
+    assert isinstance(refused, Refusal) and refused.code == "small_arc"
+    choose(measured, trunk_id)
+    measured.wait(lambda t: f"Accept an arc of {refused.section.coverage_deg:.0f}" in t.html())
+    measured.bridge_send("accept-arc", trunk_id)
+    measured.wait(lambda t: said(t, "Smaller arc accepted") and "arc_accepted" in t.html(), LONG)
+    assert isinstance(session.measurement(trunk_id).result, DbhEstimate)
+    # So little that no diameter comes of it: it says why, and nothing is changed.
+    session.do(commands.withdraw_correction(trunk_id, "least_arc"))
+    leave_out(-0.95 * section.ring_radius_m)
+    before = session.document
+    measured.wait(lambda t: "data-dbh" not in t.html())
+    measured.bridge_send("accept-arc", trunk_id)
+    measured.wait_notification("That gives no diameter either")
+    assert session.document is before
 
 
 def test_the_remedies_of_a_refusal_are_those_that_can_be_done() -> None:

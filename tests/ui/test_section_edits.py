@@ -1,9 +1,12 @@
 """What is drawn in a section, in the frame of the source; tape values as people type them."""
 
+import re
+
 import numpy as np
 import plots
 import pytest
 
+from dbh_studio.app.commands import correct_measurement
 from dbh_studio.app.section_edits import (
     drawn_points,
     drawn_polygon,
@@ -12,11 +15,13 @@ from dbh_studio.app.section_edits import (
     ring_in_source,
     tape_cm,
 )
+from dbh_studio.core.corrections import Correction
 from dbh_studio.core.dbh import DbhEstimate
 from dbh_studio.core.measured import Diameter
 from dbh_studio.core.polygons import inside_polygon
 from dbh_studio.core.stem_profile import ProfilePoint
 from dbh_studio.errors import CommandError
+from dbh_studio.ui.profile_svg import profile_svg
 
 
 @pytest.mark.parametrize(
@@ -58,6 +63,17 @@ def test_what_a_page_sends_is_a_polygon_or_refused(payload):
         drawn_polygon(payload, at_least=3)
 
 
+@pytest.mark.parametrize(("height_m", "anchor"), [(1.0, "start"), (2.0, "middle"), (3.0, "end")])
+def test_the_height_in_the_picture_of_the_stem_keeps_clear_of_its_axis_and_edge(height_m, anchor):
+    profile = tuple(ProfilePoint(1.0 + 0.1 * k, Diameter(30.0 - k, 29.0 - k, 31.0 - k), 360.0) for k in range(21))
+    svg = profile_svg(profile, height_m=height_m, tree_id=3)
+    (found,) = re.findall(rf'<text x="([0-9.]+)" y="[0-9.]+" text-anchor="(\w+)"[^>]*>{height_m:.2f} m</text>', svg)
+    assert found[1] == anchor
+    width = 48  # of "1.00 m", 12 px high, and the axis' "31 cm" ends at 40
+    left = float(found[0]) - {"start": 0, "middle": width / 2, "end": width}[anchor]
+    assert left >= 40 and left + width <= 340
+
+
 def test_other_heights_are_the_nearest_that_have_a_diameter():
     size = Diameter(30.0, 29.0, 31.0)
     profile = tuple(ProfilePoint(h, size if h != 1.3 else None, 360.0) for h in (0.5, 1.0, 1.2, 1.3, 1.5, 3.0))
@@ -67,6 +83,19 @@ def test_other_heights_are_the_nearest_that_have_a_diameter():
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     return plots.measured_session(tmp_path_factory.mktemp("plot"))
+
+
+def test_the_last_points_of_a_section_are_not_left_out_in_two_strokes_either(session):
+    document = session.document
+    trunk_id = document.trunks.ids[0]
+    section = session.measurement(trunk_id).result.section
+    right, left = ([[0.0, -5.0], [s * 5.0, -5.0], [s * 5.0, 5.0], [0.0, 5.0]] for s in (1, -1))
+    out = drawn_points(session, document, trunk_id, section, right)
+    half = correct_measurement(trunk_id, Correction("left_out", tuple(out.tolist()))).apply(document)
+    with pytest.raises(CommandError, match="no point of the section would be left"):
+        drawn_points(session, half, trunk_id, section, left)
+    with pytest.raises(CommandError, match="No point of the section lies there"):
+        drawn_points(session, half, trunk_id, section, right)
 
 
 def test_what_is_drawn_round_are_the_points_of_that_side(session):

@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import getpass
 import logging
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +27,10 @@ from dbh_studio.io.project import (
     read_history,
     within,
 )
+
+# The environment variable with the name that decisions are signed with.
+AUTHOR_VARIABLE = "DBH_STUDIO_AUTHOR"
+COMMAND_LINE = "command line"
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +68,7 @@ class Autosave:
         session: The plot; its `saver` becomes this.
         writer: The right to write its folder; closed with this.
         background: Save on a thread; otherwise before the command returns, and the plot itself each time.
-        author: Whom the history names; the system's user by default.
+        author: Whom the history names; see `author_of` for who it is by default.
         opened: What was read of the folder, where the plot comes from there; None where it is new there.
         is_new: Save the state at hand, too; by default where nothing was read.
         label: What the history says of that.
@@ -88,7 +93,7 @@ class Autosave:
     ) -> None:
         self._session = session
         self._writer = writer
-        self._author = user_name() if author is None else author
+        self._author = author_of(is_command=not background) if author is None else author
         self._quiet_s, self._retry_s, self._most_log_bytes = quiet_s, retry_s, most_log_bytes
         self._condition = threading.Condition()
         self._saving = threading.Lock()
@@ -359,6 +364,17 @@ class Autosave:
     def _entry(self, label: str, number: int = 0) -> HistoryEntry:
         when = datetime.now(timezone.utc).isoformat(timespec="seconds")
         return HistoryEntry(when, self._author, label, number)
+
+
+def author_of(*, is_command: bool) -> str:
+    """Whom the history names: whoever `AUTHOR_VARIABLE` names, else the system's user.
+
+    Args:
+        is_command: A command does it, without a person at the studio: then not the user, for who signs in to a computer
+            that runs commands is often nobody in particular.
+    """
+    named = os.environ.get(AUTHOR_VARIABLE, "").strip()
+    return named or (COMMAND_LINE if is_command else user_name())
 
 
 def user_name() -> str:

@@ -23,3 +23,13 @@ def cache_folder(cache_dir: Path | None = None) -> Path:
     except ImportError:
         return Path.home() / ".cache" / "dbh-studio"
     return user_cache_path("dbh-studio", appauthor=False)
+
+
+def why_not_writable(folder: Path) -> str:
+    """Why files cannot be put into a folder, which may have to be made; empty where they can. Makes nothing."""
+    above = (folder.absolute(), *folder.absolute().parents)
+    # os.path, not pathlib: that one raises where a folder may not be entered.
+    existing = next(path for path in above if os.path.exists(path))  # noqa: PTH110
+    if not os.path.isdir(existing):  # noqa: PTH112
+        return f"{existing.name} is not a folder"
+    return "" if os.access(existing, os.W_OK | os.X_OK) else "permission denied"

@@ -35,6 +35,7 @@ _CORRECTED: dict[CorrectionKind, str] = {
     "above": "place of measurement",
     "ground": "ground",
     "curve": "curve",
+    "least_arc": "arc that is enough",
     "left_out": "points",
     "ring": "ring",
     "tape": "tape value",

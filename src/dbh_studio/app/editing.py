@@ -17,12 +17,12 @@ import numpy as np
 from dbh_studio.app.commands import Command, existing_trunk
 from dbh_studio.app.document import Document
 from dbh_studio.app.edit_pool import blocks_of
-from dbh_studio.app.edits import add_trunk, assign_points, keep_only, split_trunk
+from dbh_studio.app.edits import LEAST_POINTS, add_trunk, assign_points, keep_only, split_trunk
 from dbh_studio.app.session import Session
 from dbh_studio.core.arrays import Int64
 from dbh_studio.core.dbh import Refusal
 from dbh_studio.core.picking import View
-from dbh_studio.core.trunk_edits import beyond_plane, grown, plane_of_line, shrunk
+from dbh_studio.core.trunk_edits import beyond_plane, grown, n_beside_line, plane_of_line, shrunk
 from dbh_studio.core.trunks import Trunk
 from dbh_studio.errors import CommandError
 from dbh_studio.settings import TrunkSettings
@@ -32,7 +32,7 @@ STEP_M = 0.03
 
 
 def split_by_line(session: Session, trunk_id: int, view: View, first_xy: Any, last_xy: Any) -> Command:
-    """Cut a trunk in two along a line drawn on the screen.
+    """Cut a trunk in two along a line drawn on the screen; beyond its ends the cut goes on.
 
     Raises:
         CommandError: There is no such trunk, the line is no line, or it misses the trunk.
@@ -41,6 +41,12 @@ def split_by_line(session: Session, trunk_id: int, view: View, first_xy: Any, la
         through, normal = plane_of_line(view, first_xy, last_xy)
     except ValueError:
         raise CommandError("The line is too short to cut along.", "Draw it through the whole trunk.") from None
+    points = session.points_world(session.document)[existing_trunk(session.document, trunk_id).points]
+    # A line beside the trunk may well point at it, and what lies beyond its ends is cut, too.
+    if min(n_beside_line(view, points, first_xy, last_xy)) < LEAST_POINTS:
+        raise CommandError(
+            f"The line does not cross trunk {trunk_id}.", "Draw it through the trunk, so that parts lie on both sides."
+        )
     return split_by_plane(session, trunk_id, through, normal)
 
 

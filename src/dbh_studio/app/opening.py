@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dbh_studio.app.autosave import Autosave
 from dbh_studio.app.candidates import keep_offers, kept_offers
@@ -28,6 +28,7 @@ from dbh_studio.errors import (
     ProjectError,
     ProjectExistsError,
     ProjectMismatchError,
+    ProjectUnwritableError,
     SettingError,
 )
 from dbh_studio.io.project import (
@@ -36,6 +37,7 @@ from dbh_studio.io.project import (
     ProjectWriter,
     UndoStates,
     is_project,
+    read_history,
     read_plot,
     read_project,
 )
@@ -154,6 +156,24 @@ def open_plot(
     return session
 
 
+def open_or_read(path: Path | str, **options: Any) -> Session:
+    """As `open_plot`; a plot that lies where nothing can be written is opened for reading only, and says so."""
+    try:
+        return open_plot(path, **options)
+    except ProjectUnwritableError as error:
+        session = open_plot(path, **{**options, "read_only": True})
+        what = "It is open for reading only, and cannot be changed here."
+        how = "To go on with it, press “Save a copy” in step 1: what you do from then on is saved in the copy."
+        say_read_only(session, "its folder cannot be written", f"{error.problem} {what} {how}")
+        return session
+
+
+def say_read_only(session: Session, why: str, note: str) -> None:
+    """Say of a plot why it is only read: in a few words for the header, and in whole ones."""
+    session.held_by, session.read_only_note = why, note
+    session.reopening_notes = (note, *session.reopening_notes)
+
+
 def save_as(
     session: Session,
     folder: Path | str,
@@ -163,6 +183,9 @@ def save_as(
     label: str = "Create the plot",
 ) -> Autosave:
     """Keep a plot in `folder` from now on; what it was kept in before stays as it is, and is released.
+
+    One that was open for reading only can be changed from then on. Masks that cannot be brought along are told in its
+    `reopening_notes`: the plot itself is saved.
 
     Args:
         overwrite: Replace a plot that is there already.
@@ -176,12 +199,16 @@ def save_as(
     if not overwrite:
         _check_is_new(folder)
     masks_before, votes_before = masks_folder(session), votes_folder(session)
+    # What is there stays there.
+    earlier = session.saver.folder if session.saver is not None else session.read_from
     writer = ProjectWriter(folder)
     try:
         # Again, now that nobody else can write it: two processes may have come this far at once.
         if not overwrite:
             _check_is_new(folder)
         writer.put_history_aside()
+        if earlier is not None:
+            writer.log(read_history(earlier))
     except ProjectError:
         writer.close()
         raise
@@ -195,7 +222,14 @@ def save_as(
         raise ProjectError(problem)
     if before is not None:
         before.close()
-    carry_masks(masks_before, folder.absolute() / MASKS_FOLDER, move=before is None)
+    session.is_read_only, session.held_by, session.read_from = False, "", None
+    session.reopening_notes = tuple(note for note in session.reopening_notes if note != session.read_only_note)
+    try:
+        carry_masks(masks_before, folder.absolute() / MASKS_FOLDER, move=earlier is None)
+    except FileError as error:
+        note = f"The plot is saved in {folder.name}, but its masks are not all there; they are still in {masks_before}."
+        session.reopening_notes = (*session.reopening_notes, f"{note} {error}")
+        _log.warning("%s %s", note, error)
     carry_votes(votes_before, folder.absolute() / "cache")
     keep_search(folder, session)
     keep_offers(folder, session)

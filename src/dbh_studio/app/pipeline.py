@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dbh_studio.app.cache import why_not_writable
 from dbh_studio.app.commands import change_settings, rename_plot, replace_trunks
 from dbh_studio.app.derived import stem_setup_of
 from dbh_studio.app.document import Direction, Document
@@ -304,6 +304,7 @@ def run_plot(
     plot_id: str = "",
     relocate: Path | str | None = None,
     overwrite: bool = False,
+    needs_search: bool = False,
     in_process: bool = True,
     progress: Progress = ignore_progress,
 ) -> RunResult:
@@ -320,9 +321,11 @@ def run_plot(
         plot_id: What to call the plot; the file's name by default.
         relocate: Where the cloud of a saved plot is now.
         overwrite: Replace a plot that an earlier run left in `out_dir`, and ``NAME.csv``. Edits made in them are lost.
+        needs_search: The steps of the search for trunks are wanted: fail before the work where there will be none.
         in_process: Work here rather than in a child process.
 
     Raises:
+        CommandError: `needs_search`, and the trunks were not searched for.
         UnscaledCloudError: The data does not tell its unit and no scale was given.
         ProjectExistsError: `out_dir` has such a plot already and `overwrite` is False.
         ProjectError: `out_dir` cannot be written; told before the work is done.
@@ -355,6 +358,8 @@ def run_plot(
         check_not_source(csv_path, session.document.source.used)
         _configure(session, settings, plot_id)
         notes = [*session.notes]
+        if needs_search and masks is None:
+            _check_searched(session)
         mask_set: VotingMasks | None = None
         if masks is not None:
             _check_replaceable_trunks(session, overwrite=overwrite)
@@ -417,6 +422,26 @@ def _check_replaceable_trunks(session: Session, *, overwrite: bool) -> None:
         raise CommandError(
             f"The saved plot has {len(session.document.trunks)} trunks already, perhaps with edits.",
             "Measure it without masks, or say that its trunks may be replaced (--overwrite).",
+        )
+
+
+def _check_searched(session: Session) -> None:
+    """Raise CommandError where the trunks of a run come from elsewhere than a search."""
+    from dbh_studio.core.treeids import find_tree_id_attribute
+
+    if len(session.document.trunks):
+        if session.last_search is None:
+            raise CommandError(
+                "The trunks of this plot were not searched for, so there are no steps to write.",
+                "Find them first: `dbh-studio run` on the cloud itself searches for them. Or leave --steps away.",
+            )
+        return
+    settings = session.document.settings
+    name = find_tree_id_attribute(session.cloud) if settings.trunks.use_existing_ids else None
+    if name is not None and len(_trunks_from_ids(session.cloud.attributes[name], settings.measure.min_points)[0]):
+        raise CommandError(
+            f"The trees are taken over from the file (its attribute {name}), so there are no steps of a search.",
+            "Leave --steps away, or have them searched for: `--set trunks.use_existing_ids=false`.",
         )
 
 
@@ -504,12 +529,7 @@ def _check_table(csv_path: Path, path: Path, *, is_saved: bool, overwrite: bool)
 
 def _check_writable(folder: Path) -> None:
     """Raise ProjectError unless `folder` can be written or made; makes nothing."""
-    above = (folder.absolute(), *folder.absolute().parents)
-    # os.path, not pathlib: that one raises where a folder may not be entered.
-    existing = next(path for path in above if os.path.exists(path))  # noqa: PTH110
-    problem = "" if os.access(existing, os.W_OK | os.X_OK) else "permission denied"
-    problem = problem if os.path.isdir(existing) else f"{existing.name} is not a folder"  # noqa: PTH112
-    if problem:
+    if problem := why_not_writable(folder):
         raise ProjectError(f"The folder {folder} cannot be written ({problem}).", "Choose another folder.")
 
 

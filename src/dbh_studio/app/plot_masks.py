@@ -14,7 +14,9 @@ it.
 from __future__ import annotations
 
 import hashlib
+import logging
 import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -22,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dbh_studio.app.cache import cache_folder
+from dbh_studio.app.cache import cache_folder, why_not_writable
 from dbh_studio.core.mask_record import MaskRecord
 from dbh_studio.core.progress import Progress, ignore_progress
 from dbh_studio.errors import CommandError, FileError
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
     from dbh_studio.app.session import Session
     from dbh_studio.core.posed_images import PosedImage, PosedImages
     from dbh_studio.io.masks import MaskStore, Review, StoredMask, TrunkMask
+
+_log = logging.getLogger(__name__)
 
 MASKS_FOLDER = "masks"
 _INDEX = "index.jsonl"
@@ -48,11 +52,31 @@ _METHODS: dict[str, Literal["detector", "prompted", "brought"]] = {
 
 
 def masks_folder(session: Session) -> Path:
-    """Where the masks of a plot are: beside the saved plot, else in the cache. It may not be there yet."""
+    """Where the masks of a plot are: beside the saved plot, else in the cache. It may not be there yet.
+
+    Where the cache cannot be written they are in a folder that goes when the program ends; that is logged once.
+    """
     folder = session.saver.folder if session.saver is not None else session.read_from
     if folder is not None:
         return folder / MASKS_FOLDER
-    return cache_folder() / _UNSAVED / session.document.source.fingerprint
+    unsaved = cache_folder() / _UNSAVED
+    if problem := why_not_writable(unsaved):
+        if _passing_folder is None:
+            words = "The cache %s cannot be written (%s): masks are kept for this run only, until the plot is saved."
+            _log.warning(words, unsaved, problem)
+        unsaved = _passing()
+    return unsaved / session.document.source.fingerprint
+
+
+_passing_folder: tempfile.TemporaryDirectory[str] | None = None
+
+
+def _passing() -> Path:
+    """A folder that goes with the program."""
+    global _passing_folder
+    if _passing_folder is None:
+        _passing_folder = tempfile.TemporaryDirectory(prefix="dbh-studio-masks-", ignore_cleanup_errors=True)
+    return Path(_passing_folder.name)
 
 
 def mask_store(session: Session) -> MaskStore:
@@ -426,4 +450,4 @@ def _file_of(photo: PosedImage) -> Path:
 
 def _check_writable(session: Session) -> None:
     if session.is_read_only:
-        raise CommandError("The plot is open for reading only.", "Open it for writing to change it.")
+        raise CommandError("The plot is open for reading only.", "Open it for writing, or save a copy, to change it.")

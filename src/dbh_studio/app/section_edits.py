@@ -51,6 +51,7 @@ def drawn_points(
     points[:, 2] -= z_ground_m
     low, high = min(section.band_m[0], section.hom_m - _BELOW_M), max(section.band_m[1], section.hom_m + _ABOVE_M)
     there = (points[:, 2] >= low) & (points[:, 2] <= high)
+    there &= ~np.isin(trunk.points, np.array(document.record(trunk_id).correction("left_out") or (), np.int64))
     uv = section.stem_from_section.inverse().apply(points[there])[:, :2]
     polygon = np.asarray(polygon_uv_m, np.float64)
     if len(polygon) > _MOST_CORNERS:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 HISTORY_LIMIT = 200
+_TO_WRITE = "Open it for writing to change it, or save a copy and change that (step 1 of the studio)."
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +130,8 @@ class Session:
         self.saver: Autosave | None = None
         # What was lost, or brought back, when the saved plot was opened, in plain words.
         self.reopening_notes: tuple[str, ...] = ()
+        # Of `reopening_notes` the one that says why it is only read.
+        self.read_only_note = ""
         # Who writes the saved plot, where that is why it is only read.
         self.held_by = ""
         # The saved plot it was read from, where it is only read.
@@ -270,7 +273,7 @@ class Session:
 
     def _check_writable(self) -> None:
         if self.is_read_only:
-            raise CommandError("The plot is open for reading only.", "Open it for writing to change it.")
+            raise CommandError("The plot is open for reading only.", _TO_WRITE)
 
     def _apply(self, command: Command, before: Document) -> Document:
         """Apply with ids counted on from all ever given out: an undone trunk's number may stand in somebody's notes."""

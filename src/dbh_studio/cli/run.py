@@ -91,6 +91,7 @@ def run_plot(options: argparse.Namespace) -> int:
                 plot_id=options.name,
                 relocate=options.cloud,
                 overwrite=options.overwrite,
+                needs_search=options.steps is not None,
                 progress=progress,
             )
     except UnscaledCloudError:

@@ -112,7 +112,7 @@ def _open(studio: Studio, options: argparse.Namespace, progress: ProgressLine) -
     if options.cloud is not None and not is_saved:
         raise StudioError(f"{path.name} is not a saved plot.", "Leave --cloud away, or name a NAME.dbh.")
     try:
-        return opening.open_plot(
+        return opening.open_or_read(
             path,
             scale=options.scale,
             up=options.up,
@@ -249,4 +249,6 @@ def _closing_words(studio: Studio) -> str:
     session = studio.session
     if session is not None and session.saver is not None:
         return f"The plot is kept in {plain(str(session.saver.folder))}, saved after every change. Ctrl+C ends it."
+    if session is not None and session.read_only_note:
+        return f"{plain(session.read_only_note)} Ctrl+C ends it."
     return "Ctrl+C ends it." if session is None else "Nothing is saved: it is open for reading only. Ctrl+C ends it."

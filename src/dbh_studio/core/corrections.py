@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 from dbh_studio.settings import CurveName, HeightAlong, MeasureAbove, SlopeBase
 
 CorrectionKind = Literal[
-    "breast_height", "base", "along", "above", "ground", "curve", "left_out", "ring", "tape", "tape_height"
+    "breast_height", "base", "along", "above", "ground", "curve", "least_arc", "left_out", "ring", "tape", "tape_height"
 ]
 CORRECTION_KINDS: tuple[CorrectionKind, ...] = get_args(CorrectionKind)
 
@@ -31,9 +31,9 @@ class Correction:
         kind: Which thing.
         value: Of `kind`: ``breast_height`` metres above the base; ``base``, ``along`` and ``above`` a word of
             `SlopeBase`, `HeightAlong`, `MeasureAbove`; ``ground`` an (x, y, z) place of the ground; ``curve`` a
-            `CurveName`; ``left_out`` sorted indices of the cloud's points that are not to be measured; ``ring`` a
-            closed polygon of (x, y, z) drawn around the stem; ``tape`` a diameter read in the field, cm, kept beside
-            the estimate; ``tape_height`` the height it was read at, metres.
+            `CurveName`; ``least_arc`` degrees of the ring that are enough; ``left_out`` sorted indices of the cloud's
+            points that are not to be measured; ``ring`` a closed polygon of (x, y, z) drawn around the stem; ``tape`` a
+            diameter read in the field, cm, kept beside the estimate; ``tape_height`` the height it was read at, metres.
         who: Who said so; empty where nobody signed.
         when: ISO 8601, UTC; empty where unknown.
         why: In the person's words.
@@ -112,6 +112,7 @@ _CHECKS: dict[str, Callable[[Any], Any]] = {
     "above": _one_of(get_args(MeasureAbove)),
     "ground": _place,
     "curve": _one_of(get_args(CurveName)),
+    "least_arc": _number(0.0, 360.0, "degrees"),
     "left_out": _indices,
     "ring": _ring,
     "tape": _number(0.1, _THICKEST_CM, "cm"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from dbh_studio.core.arrays import Bool, Float64, readonly
 from dbh_studio.core.axis import StemAxis
@@ -26,7 +27,9 @@ _SAME_PLANE_M = 0.02  # a ring drawn in the picture of a section lies in its pla
 _PICTURE_M = 0.15  # of stem to either side, as in the other methods' sections
 _NEAR_M, _NEAR_SHARE = 0.01, 0.08  # noise, and share of the radius a hand may be off by: points so near support it
 _AWAY_M = 0.05  # from breast height, as `not_at_height` elsewhere
+_LEAST_ARC_DEG = 60.0  # of points along a ring beside the stem's axis from which on it is one of its stems
 _COARSE = 0.005  # too thin by its corners, relative, from which on it is said: fewer than 19
+_MOST_OF_HULL = 1.01  # of the area of its hull a curve that goes round once encloses at most all
 _REDRAW = "Draw the ring again, once around the stem."
 
 
@@ -56,6 +59,7 @@ def drawn_diameter(
     section, fits = measured.section, measured.fits
     frame = section.stem_from_section if section is not None else Similarity(axis.rotation(), axis.point_m)
     ring = _in(frame, ring_m)
+    off_axis_m = float(np.hypot(*outline_centroid(ring[:, :2])))
     if section is None or abs(float(ring[:, 2].mean())) > _SAME_PLANE_M:
         frame, fits = _at_ring(frame, ring), {}
         ring = _in(frame, ring_m)
@@ -69,6 +73,11 @@ def drawn_diameter(
     seen = section.uv_m[inliers] - outline_centroid(outline)
     arc_deg, gap_deg = ring_coverage(np.arctan2(seen[:, 1], seen[:, 0]))
     radius_m = float(np.sqrt(area / np.pi))
+    if off_axis_m > 2.0 * radius_m and arc_deg < _LEAST_ARC_DEG:
+        beside = f"The ring drawn by hand lies {off_axis_m:.1f} m beside the stem, where hardly a point of it is."
+        # In the section as it was measured: there one sees where the stem is.
+        seen_in = section if measured.section is None else measured.section
+        return Refusal("implausible", beside, "Draw the ring round the stem's own points.", seen_in, measured.fits)
     section = replace(section, coverage_deg=arc_deg, max_gap_deg=gap_deg, ring_radius_m=radius_m)
     drawn = CurveFit(DRAWN, readonly(outline), perimeter, area, girth, readonly(inliers), rmse_m)
     flags = _flags(section, outline, settings, ground_note)
@@ -129,6 +138,8 @@ def _problem(outline: Float64, girth_m: float, area_m2: float, settings: Measure
     # A closed curve of no area: two strokes upon each other.
     if area_m2 < 0.2 * np.pi / 4 * (0.01 * diameter_cm) ** 2:
         return "The ring drawn by hand is hardly more than a line, seen along the stem."
+    if area_m2 > _MOST_OF_HULL * ConvexHull(outline).volume:  # in the plane the volume is the area
+        return "The ring drawn by hand goes more than once around."
     if not settings.min_diameter_cm <= diameter_cm <= settings.max_diameter_cm:
         limits = f"{settings.min_diameter_cm:g} to {settings.max_diameter_cm:g} cm"
         return f"The ring drawn by hand is {diameter_cm:.1f} cm thick, outside {limits}."

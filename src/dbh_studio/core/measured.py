@@ -46,7 +46,8 @@ class Flag:
         code: Short name for tables: ``partial_arc``, ``gap``, ``double_wall``, ``bulge``, ``buttress``, ``fluting``,
             ``not_round``, ``not_at_height``, ``neighbour``, ``fork``, ``few_points``, ``lean``, ``short_stretch``,
             ``fallback``, ``wide_interval``, ``profile``, ``ground``, ``clutter``, ``above_bulge``, ``above_buttress``,
-            ``drawn``; of the paper's curves also ``disagree``, ``thick_ring``, ``off_curve``, ``upright``.
+            ``drawn``, ``arc_accepted``; of the paper's curves also ``disagree``, ``thick_ring``, ``off_curve``,
+            ``upright``.
         words: For the forester.
     """
 

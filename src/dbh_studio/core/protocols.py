@@ -41,6 +41,7 @@ _OF_SETTINGS: Mapping[CorrectionKind, str] = {
     "along": "along",
     "above": "above",
     "curve": "curve",
+    "least_arc": "min_coverage_deg",
 }
 _OF_THE_STEM: tuple[CorrectionKind, ...] = ("ground", "left_out", "ring")
 
@@ -82,6 +83,8 @@ def own_settings(corrections: Iterable[Correction], settings: MeasureSettings) -
     changes = {name: said[kind] for kind, name in _OF_SETTINGS.items() if kind in said}
     if "breast_height" in said:
         changes.setdefault("above", "nothing")
+    if "least_arc" in said:  # it was accepted, not asked for: a plot that is content with less goes before
+        changes["min_coverage_deg"] = min(said["least_arc"], settings.min_coverage_deg)
     changes = {name: value for name, value in changes.items() if value != getattr(settings, name)}
     # Not `changed`: the bounds are those of a plot's rule, and a person may measure a stem much higher.
     return settings.model_copy(update=changes) if changes else settings
@@ -91,7 +94,9 @@ def setup_key(corrections: Iterable[Correction], settings: MeasureSettings) -> H
     """What of the corrections and settings a measurement depends on: not who said it, nor what a tape read."""
     corrections = tuple(corrections)
     of_the_stem = tuple((each.kind, each.value) for each in corrections if each.kind in _OF_THE_STEM)
-    return own_settings(corrections, settings), of_the_stem
+    # What the plot asks for is said with an arc that was accepted.
+    usual = settings.min_coverage_deg if any(each.kind == "least_arc" for each in corrections) else None
+    return own_settings(corrections, settings), of_the_stem, usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,17 +108,19 @@ class StemSetup:
         z_ground_m: Height of a ground that a person placed; None where the ground model says.
         ring_m: (M, 3) a ring drawn by hand; None where there is none.
         left_out: (N,) which of the stem's points are not measured; None where all are.
+        usual_arc_deg: The arc the plot asks for, where a person accepted a smaller one; None elsewhere.
     """
 
     settings: MeasureSettings
     z_ground_m: float | None = None
     ring_m: Float64 | None = None
     left_out: Bool | None = None
+    usual_arc_deg: float | None = None
 
     @property
     def placed(self) -> dict[str, Any]:
-        """What was put there by hand, as arguments of `stages.measure.measure_trunk`; empty for nearly every stem."""
-        given = {"z_ground_m": self.z_ground_m, "ring_m": self.ring_m}
+        """What a person put there or accepted, as arguments of `stages.measure.measure_trunk`; mostly empty."""
+        given = {"z_ground_m": self.z_ground_m, "ring_m": self.ring_m, "usual_arc_deg": self.usual_arc_deg}
         return {name: value for name, value in given.items() if value is not None}
 
     def measured(self, points: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
@@ -149,4 +156,5 @@ def stem_setup(
         None if ground is None else float(world_from_source.apply(np.array([ground], np.float64))[0, 2]),
         None if ring is None else readonly(world_from_source.apply(np.array(ring, np.float64)).astype(np.float64)),
         None if left_out is None else readonly(np.isin(points, np.array(left_out))),
+        settings.min_coverage_deg if own.min_coverage_deg < settings.min_coverage_deg else None,
     )

@@ -27,6 +27,7 @@ _OF_FLAG: Mapping[str, Concern] = {
     "fallback": "uncertain",
     "clutter": "uncertain",
     "partial_arc": "small_arc",
+    "arc_accepted": "small_arc",
     "gap": "small_arc",
     "neighbour": "neighbour",
     "not_round": "neighbour",

@@ -58,6 +58,25 @@ def plane_of_line(view: View, first_xy: Any, last_xy: Any) -> tuple[Float64, Flo
     return np.asarray(view.origin, np.float64), np.asarray(normal / length, np.float64)
 
 
+def n_beside_line(view: View, points: Float, first_xy: Any, last_xy: Any) -> tuple[int, int]:
+    """How many points are seen on either side of a line on the screen, between its ends and square to it.
+
+    Args:
+        view: The camera; what is behind it is on neither side.
+        points: (N, 3) in the camera's frame.
+        first_xy: (2,) screen position 0..1 where the line begins.
+        last_xy: (2,) where it ends, elsewhere.
+    """
+    square = np.array([view.aspect, 1.0])  # in which right angles are those of the picture
+    first, last = (np.asarray(end, np.float64) * square for end in (first_xy, last_xy))
+    along = last - first
+    off = view.project(points) * square - first
+    part = off @ along / float(along @ along)
+    across = off @ np.array([-along[1], along[0]])
+    is_beside = (part >= 0.0) & (part <= 1.0)
+    return int((is_beside & (across > 0)).sum()), int((is_beside & (across <= 0)).sum())
+
+
 def grown(points: Float, members: NDArray[Any], free: NDArray[Any], distance: float) -> Int64:
     """(K,) those rows of `free` that are within `distance` of a member.
 

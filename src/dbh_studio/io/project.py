@@ -16,6 +16,8 @@ command is first noted in undo.log, which is soon done; the plot itself is saved
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO
@@ -23,7 +25,7 @@ from typing import IO
 import numpy as np
 
 from dbh_studio.core.trunks import TrunkSet
-from dbh_studio.errors import ProjectError
+from dbh_studio.errors import ProjectError, ProjectUnwritableError
 from dbh_studio.io.atomic import atomic_file, sync_folder
 from dbh_studio.io.history import HISTORY_FILE, HistoryEntry, append_history, put_history_aside, read_history
 from dbh_studio.io.lock import lock_file
@@ -64,7 +66,7 @@ class ProjectWriter:
 
     Raises:
         ProjectLockedError: Another process writes it, or this one already does.
-        ProjectError: The folder cannot be made or locked.
+        ProjectUnwritableError: The folder cannot be made, locked or written.
     """
 
     def __init__(self, folder: Path | str) -> None:
@@ -73,9 +75,12 @@ class ProjectWriter:
         self.undo_log = UndoLog(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            # Files that are there already might be written in a folder that takes no new ones; a save needs both.
+            if not os.access(self.folder, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
             self._lock: IO[str] | None = lock_file(self.folder / LOCK_FILE)
         except OSError as error:
-            raise ProjectError(
+            raise ProjectUnwritableError(
                 f"The folder {self.folder} cannot be written ({error.strerror or error}).", "Choose another folder."
             ) from error
         self._next_number = 1 + max((number for number, _ in self._trunk_files()), default=0)

@@ -151,7 +151,12 @@ class AttributesSection(Section):
     def leave_tree(self) -> None:
         """Keep what was typed about the trees that were on screen, as the button Keep does."""
         session, shown = self.tab.session, self._shown
-        if session is None or shown is None or session.is_read_only or shown[0] is not session:
+        if session is None or shown is None or shown[0] is not session:
+            return
+        if session.is_read_only:
+            if any(self._typed(name) != value for name, value in shown[2].items()):
+                told = "What was typed about the tree was not kept: the plot is open for reading only."
+                self.tab.worker.notify_error(CommandError(told, "Save a copy in step 1, and type it there."))
             return
         ids = tuple(i for i in shown[1] if i in session.document.trunks)
         if ids:

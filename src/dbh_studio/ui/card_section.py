@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from dbh_studio.app.document import Document
@@ -47,7 +48,9 @@ class CardSection(Section):
     def build(self) -> None:
         """Add the card."""
         self._card = self.gui.add_html("")
-        self.tab.bridge.on("compare", self._compare)
+        bridge = self.tab.bridge
+        bridge.run(resources.files("dbh_studio.ui").joinpath("card_fields.js").read_text(encoding="utf-8"))
+        bridge.on("compare", self._compare)
 
     def refresh(self) -> None:
         """Show the chosen tree: text first, so that it is there before the picture has turned."""

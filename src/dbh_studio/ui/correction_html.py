@@ -21,6 +21,7 @@ _TITLES: dict[CorrectionKind, str] = {
     "above": "Measured above",
     "ground": "Ground",
     "curve": "Method",
+    "least_arc": "Smaller arc accepted",
     "left_out": "Points left out",
     "ring": "Ring",
     "tape": "Tape",
@@ -60,6 +61,8 @@ def _value(correction: Correction, record: TreeRecord, result: DbhEstimate | Ref
         return f"{value:.1f} cm{height}{off}"
     if correction.kind == "breast_height":
         return f"{value:.2f} m"
+    if correction.kind == "least_arc":
+        return f"{value:.0f}°"
     if correction.kind == "left_out":
         return f"{len(value):,}"
     if correction.kind == "ring":
@@ -126,6 +129,12 @@ def remedies_html(tree_id: int, refusal: Refusal, heights: Sequence[ProfilePoint
     if refusal.section is not None and len(refusal.section.uv_m):
         action = esc(f"dbhSection.begin('ring',{js(tree_id)},{js(serial)})")
         parts.append(f'<button type="button" data-do="draw-ring" onclick="{action}">Draw the ring</button>')
+    if refusal.code == "small_arc" and refusal.section is not None:
+        arc = f"{refusal.section.coverage_deg:.0f}°"
+        parts.append(
+            f'<button type="button" data-do="accept-arc" title="A diameter from what was seen, if it gives one; its '
+            f'flags say that it was accepted" onclick="{call("accept-arc", tree_id)}">Accept an arc of {arc}</button>'
+        )
     if refusal.code in _MAY_BE_TWO:
         parts.append(
             f'<button type="button" data-do="split" title="Where two stems are seen in it" '

@@ -82,8 +82,10 @@ class CorrectionSection(Section):
             ("section-draw", self._drawn),
             ("height-set", self._height_sent),
             ("tape", self._tape_sent),
+            ("tape-typed", self._tape_half_typed),
             ("withdraw", self._withdrawn),
             ("split-stems", self._split),
+            ("accept-arc", self._accept_arc),
         ):
             bridge.on(name, action)
 
@@ -125,7 +127,7 @@ class CorrectionSection(Section):
         session, shown, text = self.tab.session, self._shown, str(self._tape.value).strip()
         if session is None or shown is None or shown[:2] != (session, self.tab.view.selected) or not text:
             return
-        if session.is_read_only or shown[1] not in session.document.trunks:
+        if shown[1] not in session.document.trunks:
             return
         try:
             self._typed_tape()
@@ -232,6 +234,13 @@ class CorrectionSection(Section):
         tree, text = _pair(payload)
         if tree == self.tab.view.selected and isinstance(text, str):
             self._keep_tape(text[:100], "")
+            set_value(self._tape, "")
+
+    def _tape_half_typed(self, payload: Any) -> None:
+        """``[tree, text]`` of the card's field: kept when one goes on, as what is typed in the panel."""
+        tree, text = _pair(payload)
+        if tree == self.tab.view.selected and isinstance(text, str):
+            set_value(self._tape, text[:100])
 
     def _keep_tape(self, text: str, height: str) -> None:
         from dbh_studio.app.lengths import metres_from_text
@@ -247,6 +256,7 @@ class CorrectionSection(Section):
             raise CommandError(f"This cannot be: {error}.") from None
         session.do(command)
         set_value(self._why, "")
+        self.tab.bridge.run("dbhCard.forget()")
 
     # ---- drawn in the section
 
@@ -271,6 +281,20 @@ class CorrectionSection(Section):
         session, trunk_id = self._chosen_tree()
         if payload == trunk_id:
             session.do(split_by_stems(session, trunk_id))
+
+    def _accept_arc(self, payload: Any) -> None:
+        """Be content with the arc that was seen of the chosen tree, if that gives a diameter."""
+        session, trunk_id = self._chosen_tree()
+        document = session.document
+        refused = session.measurement(trunk_id, document=document).result
+        if payload != trunk_id or not isinstance(refused, Refusal) or refused.section is None:
+            return
+        least = float(np.floor(refused.section.coverage_deg))
+        tried = commands.correct_measurement(trunk_id, Correction("least_arc", least)).apply(document)
+        result = session.measurement(trunk_id, document=tried).result
+        if isinstance(result, Refusal):
+            raise CommandError(f"That gives no diameter either. {result.reason}", result.remedy)
+        self.correct("least_arc", least)
 
     # ---- in the 3D picture
 

@@ -13,10 +13,12 @@ from dbh_studio.app.edit_trial import do_edit, gone_trunks
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.arrays import Float64, Int64
 from dbh_studio.core.picking import View
+from dbh_studio.core.trunks import Trunk
 from dbh_studio.errors import CommandError
 
 if TYPE_CHECKING:
     from dbh_studio.ui.edit_desk import EditDesk
+    from dbh_studio.ui.edit_words import EditTool
 
 Plane = tuple[Float64, Float64]
 
@@ -26,6 +28,8 @@ class EditActions:
 
     def __init__(self, desk: EditDesk) -> None:
         self._desk = desk
+        # What was chosen, and with which tool, when points were taken off last.
+        self._took_off: tuple[Trunk | None, int, EditTool] | None = None
 
     # ---- on the selected points
 
@@ -33,6 +37,7 @@ class EditActions:
         """Take the selected points off the chosen tree, or off whosever they are."""
         points, tree = self._points(), self._desk.selected
         self._do(lambda _: edits.drop_points(points, tree), unchanged="None of the selected points belongs to it.")
+        self._took_off = self._chosen_now()
 
     def keep_only(self) -> None:
         """Take everything but the selected points off the chosen tree."""
@@ -43,6 +48,7 @@ class EditActions:
                 "Select the points of the tree that are right.",
             )
         self._do(lambda _: edits.keep_only(points, tree), unchanged="All of its points are selected.")
+        self._took_off = self._chosen_now()
 
     def make_new(self) -> None:
         """Make a trunk of the selected points, whosever they were, and choose it."""
@@ -84,6 +90,20 @@ class EditActions:
         """Take the chosen trunks away."""
         ids = self._chosen()
         self._do(lambda _: edits.delete_trunks(ids))
+
+    def delete_by_key(self) -> None:
+        """Take the selected points off; with none selected, delete the chosen trunks where they must be what is meant.
+
+        With a tool that selects in hand the key is about points, and pressed twice it is pressed once too often.
+        """
+        desk = self._desk
+        if len(desk.points) and desk.tool != "plane":
+            self.take_off()
+        elif desk.selected is not None and (desk.tool != "click" or self._took_off == self._chosen_now()):
+            them = f"tree {desk.selected} itself" if len(desk.chosen) == 1 else "the trees themselves"
+            desk.add_note(f"no points are selected. To delete {them}, press the button Delete")
+        else:
+            self.delete()
 
     def cut_by_line(self, view: View, first_xy: Float64, last_xy: Float64) -> None:
         """Cut the chosen trunk along a line on the screen."""
@@ -161,6 +181,12 @@ class EditActions:
         new = [i for i in change.after.trunks.ids if i not in change.before.trunks]
         if len(new) == 1:
             self._desk.choose(new[0])
+
+    def _chosen_now(self) -> tuple[Trunk | None, int, EditTool]:
+        """Another value once a tree is chosen (again), is changed, or another tool is in hand."""
+        desk = self._desk
+        trunk = None if desk.selected is None else desk.session.document.trunks[desk.selected]
+        return trunk, desk.n_choices, desk.tool
 
     def _points(self) -> Int64:
         if not len(self._desk.points):

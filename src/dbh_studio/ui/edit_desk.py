@@ -145,6 +145,11 @@ class EditDesk:
         return [selected, *(i for i in self._tab.view.chosen if i != selected and i in trunks)]
 
     @property
+    def n_choices(self) -> int:
+        """How often a tree was chosen in this tab, be it the same again."""
+        return self._tab.view.n_inspected
+
+    @property
     def is_visible(self) -> bool:
         """Whether the bar is in the picture."""
         return self.is_on and self._tab.view.step == "inspect" and self._tab.session is not None
@@ -261,8 +266,6 @@ class EditDesk:
             self.act.call(number)
         elif action == "restore" and (value is None or type(value) is int):
             self.act.restore(value)
-        elif action == "delete" and len(self.points) and self.tool != "plane":
-            self.act.take_off()
         elif action in ("only", "others", "slice"):
             self._look(action)
         elif action in ("wider", "narrower"):
@@ -368,6 +371,7 @@ _SIMPLE = {
     "group": "group",
     "ungroup": "ungroup",
     "delete": "delete",
+    "delete-key": "delete_by_key",
     "split": "split",
     "grow": "grow",
     "shrink": "shrink",

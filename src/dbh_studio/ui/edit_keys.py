@@ -17,7 +17,7 @@ _COMMANDS: tuple[tuple[str, str | None, str | None, str], ...] = (
     ("Correct: only this tree, or what is about it too", "I", None, "only"),
     ("Correct: hide the others", "O", None, "others"),
     ("Correct: slice at breast height", "U", None, "slice"),
-    ("Correct: take the selected points off, or delete the trunk", "delete", None, "delete"),
+    ("Correct: take the selected points off, or delete the trunk", "delete", None, "delete-key"),
     ("Correct: keep only the selected points", "delete", "shift", "keep"),
     ("Correct: make the selected points a new trunk, or cut by the plane", "enter", None, "enter"),
     ("Correct: give the selected points to another tree", "G", None, "give"),

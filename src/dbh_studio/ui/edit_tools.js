@@ -14,9 +14,19 @@ window.dbhEdit = window.dbhEdit || (() => {
     e.type = 'button';
     e.title = tip;
     e.dataset.edit = what;
-    // The key Enter or Space must not press it again afterwards.
-    e.addEventListener('click', () => { e.blur(); (action || (() => act(what)))(); });
+    e.addEventListener('click', event => {
+      e.blur();  // the key Enter or Space must not press it again afterwards
+      if (!isSecondOfDouble(event, e)) (action || (() => act(what)))();
+    });
     return e;
+  };
+  // After a press other buttons may lie where it was: a double click on Take off must not press what comes to lie there.
+  let pressed = {e: null, at: -1e9, x: 0, y: 0};
+  const isSecondOfDouble = (event, e) => {
+    const near = Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < 8 && event.detail > 0;
+    const isOther = near && e !== pressed.e && performance.now() - pressed.at < 400;
+    pressed = {e: isOther ? pressed.e : e, at: performance.now(), x: event.clientX, y: event.clientY};
+    return isOther;
   };
   const slider = (parent, what, name, low, high, step) => {
     const label = make('label', '', parent, name + ' '), e = make('input', '', label), said = make('output', '', label);

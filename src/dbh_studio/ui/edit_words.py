@@ -31,7 +31,7 @@ KEYS: tuple[tuple[str, str], ...] = (
     ("I", "Only this tree, or also what is about it"),
     ("O", "Hide the others"),
     ("U", "Slice at breast height"),
-    ("Delete", "Take the selected points off; with none selected, delete the trunk"),
+    ("Delete", "Take the selected points off; with the tool Click and none selected, delete the trunk"),
     ("Shift+Delete", "Keep only the selected points"),
     ("Enter", "Make the selected points a new trunk; cut by the plane"),
     ("G", "Give the selected points to another tree: click it"),

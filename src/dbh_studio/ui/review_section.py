@@ -6,7 +6,7 @@ from typing import Any
 
 from dbh_studio.app import commands
 from dbh_studio.app.document import Document
-from dbh_studio.app.session import Session
+from dbh_studio.app.session import Change, Session
 from dbh_studio.core.dbh import DbhEstimate
 from dbh_studio.core.review_queue import (
     FILTERS,
@@ -49,6 +49,8 @@ class ReviewSection(Section):
         """Add the bar."""
         self._bar = self.gui.add_html("", visible=False)
         self._known: tuple[Session, Document, tuple[int, ...], tuple[QueueEntry, ...]] | None = None
+        # Trees that were decided about in one step of this tab, where they were several.
+        self._together: set[frozenset[int]] = set()
         bridge = self.tab.bridge
         bridge.on("review", self._review_pressed)
         bridge.on("review-filter", self._filter_chosen)
@@ -124,7 +126,19 @@ class ReviewSection(Section):
         for panel in self.tab.panels:  # what was typed about it belongs to what is accepted
             panel.leave_tree()
         session.do(commands.review_trees(decided(session, ids, decision)))
+        if len(ids) > 1:
+            self._together.add(frozenset(ids))
         self._go_on(queue, ids)
+
+    def went_back(self, change: Change) -> None:
+        """After Undo: show the trees again whose decision it took back; accepting them had gone on to the next."""
+        before, after, view = change.before, change.after, self.tab.view
+        if view.step != "inspect" or before.trunks is not after.trunks:
+            return
+        ids = frozenset(i for i in {*before.trees, *after.trees} if before.record(i).review != after.record(i).review)
+        # Not those that were accepted by their number alone: nobody had chosen them.
+        if len(ids) == 1 or ids in self._together:
+            self.tab.select(min(ids), fly=True, several=ids if len(ids) > 1 else frozenset())
 
     def _go_on(self, queue: tuple[QueueEntry, ...], ids: tuple[int, ...]) -> None:
         view = self.tab.view

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -19,12 +17,12 @@ from dbh_studio.app import pipeline
 from dbh_studio.app.autosave import Autosave, SaveStatus
 from dbh_studio.app.document import Document
 from dbh_studio.app.jobs import run_job
-from dbh_studio.app.opening import open_plot, plot_name, read_cloud
+from dbh_studio.app.opening import open_or_read, open_plot, plot_name, read_cloud, save_as, say_read_only
 from dbh_studio.app.session import Change, Session
 from dbh_studio.core.progress import Progress
 from dbh_studio.core.reconstruction import Reconstruction
-from dbh_studio.errors import FileError, ProjectError, ProjectLockedError, StudioError
-from dbh_studio.io.project import FOLDER_SUFFIX, is_project
+from dbh_studio.errors import ProjectError, ProjectLockedError, StudioError
+from dbh_studio.io.project import is_project
 from dbh_studio.io.reader import SUPPORTED_SUFFIXES
 from dbh_studio.ui.bind import TabWorker, for_each_tab
 from dbh_studio.ui.display_cloud import DisplayCloud
@@ -33,6 +31,7 @@ from dbh_studio.ui.mask_desk import MaskDesk
 from dbh_studio.ui.mask_jobs import MaskJobs
 from dbh_studio.ui.photo_desk import PhotoDesk
 from dbh_studio.ui.photo_render import PhotoCache
+from dbh_studio.ui.plot_places import place_for_copy, project_dir_for
 from dbh_studio.ui.returning import LostPages
 from dbh_studio.ui.server import StudioServer
 from dbh_studio.ui.studio_jobs import BusyError, RunningJob, StudioJobs
@@ -42,8 +41,6 @@ from dbh_studio.ui.uploads import UploadedFile, receive
 log = logging.getLogger(__name__)
 
 DEFAULT_DISPLAY_POINTS = 3_000_000
-# Bytes of a saved plot's name; file systems allow 255 with the suffix.
-_LONGEST_NAME = 200
 # What is done in one tab is told in the others so often at most.
 _BETWEEN_NOTES_S = 2.0
 
@@ -287,19 +284,39 @@ class Studio(StudioJobs):
 
     @staticmethod
     def _open_or_read(path: Path, **options: Any) -> Session:
-        """Open a plot; one that another program writes is opened for reading only, and says so."""
+        """Open a plot; one that cannot be written, or that another program writes, is opened for reading only."""
         try:
-            return open_plot(path, **options)
+            return open_or_read(path, **options)
         except ProjectLockedError as error:
             session = open_plot(path, **{**options, "read_only": True})
-            session.held_by = error.problem.rstrip(".")
-            what = "It is open here for reading only, as it was saved last; close it there to change it here."
-            session.reopening_notes = (f"{error.problem} {what}", *session.reopening_notes)
+            what = "It is open here for reading only, as it was saved last; close it there to change it here, or press "
+            what += "“Save a copy” in step 1 to go on in a copy."
+            say_read_only(session, error.problem.rstrip("."), f"{error.problem} {what}")
             return session
 
     def project_dir_for(self, path: Path) -> Path:
         """Where a plot made from `path` is saved."""
         return project_dir_for(path, self._uploads_folder)
+
+    def save_copy(self, folder: Path) -> None:
+        """Save the open plot elsewhere, and go on there: what could not be changed or saved where it was now can be.
+
+        Raises:
+            StudioError: It cannot be saved there; says why, and the plot stays as it was.
+        """
+        session = self._require_session()
+        # Masks that are being painted go along.
+        self.masks.save()
+        saver = save_as(session, folder, label="Save a copy")
+        saver.subscribe(self._save_status_changed)
+        self._problem_told = ""
+        self.refresh_tabs()
+        self._each_tab(lambda tab: tab.worker.notify("Saved in a copy", f"{saver.folder}: you go on there.", "success"))
+
+    def place_for_copy(self) -> Path:
+        """Where a copy of the open plot may be saved: a folder that is not there yet."""
+        document = self._require_session().document
+        return place_for_copy(document.plot_id or plot_name(document.source.path), self._uploads_folder)
 
     def _check_not_open(self, path: Path, folder: Path) -> None:
         """Raise StudioError where a plot would be saved in the folder of the open one: a plot has one writer."""
@@ -370,27 +387,3 @@ class Studio(StudioJobs):
             self._keep_typed()
             self.session.close()
         self.server.stop()
-
-
-def project_dir_for(path: Path, fallback: Path) -> Path:
-    """Where the plot of a source file is saved: beside it, or in `fallback` where that folder is not writable.
-
-    Raises:
-        FileError: `fallback` cannot be made.
-    """
-    absolute = path.absolute()
-    # Two plots of one name in two read-only folders, or of one long beginning, must not share a saved plot.
-    digest = hashlib.blake2b(str(absolute).encode("utf-8", "replace"), digest_size=4).hexdigest()
-    encoded = plot_name(path).encode("utf-8", "replace")
-    name = encoded[:_LONGEST_NAME].decode("utf-8", "ignore")
-    with_digest = f"{name}-{digest}{FOLDER_SUFFIX}"
-    beside = absolute.parent / (with_digest if len(encoded) > _LONGEST_NAME else f"{name}{FOLDER_SUFFIX}")
-    if beside.exists() or os.access(beside.parent, os.W_OK):
-        return beside
-    try:
-        fallback.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(
-            path, f"There is no place to save its plot: {error.strerror or error}.", f"Make {fallback} writable."
-        ) from None
-    return fallback / with_digest

@@ -398,7 +398,7 @@ class Tab:
             return
         # A key pressed once too often is no error.
         if self.session is not None and self.session.can_undo:
-            self.session.undo()
+            self.inspect.review.went_back(self.session.undo())
 
     def _redo_pressed(self) -> None:
         if self.session is not None and self.session.can_redo:

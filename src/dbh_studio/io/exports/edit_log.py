@@ -27,6 +27,7 @@ CORRECTION_TITLES: Mapping[CorrectionKind, str] = {
     "above": "Measured above",
     "ground": "Ground",
     "curve": "Curve",
+    "least_arc": "Smaller arc accepted",
     "left_out": "Points left out",
     "ring": "Ring drawn by hand",
     "tape": "Tape value",
@@ -91,6 +92,8 @@ def correction_words(correction: Correction, words: Words = _METRIC) -> str:
         return words.diameter(value, unit=True)
     if correction.kind in ("breast_height", "tape_height"):
         return words.height(value, unit=True)
+    if correction.kind == "least_arc":
+        return f"{value:.0f}°"
     if correction.kind == "left_out":
         return f"{len(value):,} points"
     if correction.kind == "ring":

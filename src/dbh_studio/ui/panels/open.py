@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import viser
 
 from dbh_studio.app import commands
@@ -9,6 +12,7 @@ from dbh_studio.app.document import Direction, unit_direction
 from dbh_studio.app.session import Session
 from dbh_studio.core.transforms import UP_AXES
 from dbh_studio.errors import StudioError
+from dbh_studio.io.project import FOLDER_SUFFIX
 from dbh_studio.ui import html
 from dbh_studio.ui.panels.base import Panel, set_content, set_disabled, set_value, set_visible, typed_path
 from dbh_studio.ui.uploads import UploadedFile
@@ -47,6 +51,11 @@ class OpenPanel(Panel):
         )
         tab.worker.on_upload(self._upload, self._uploaded, allowed_suffixes=suffixes, on_progress=self._uploading)
         self._upload_bar = gui.add_progress_bar(0.0, visible=False)
+        self._copy_folder = gui.add_text(
+            "Save in", "", hint="a new folder NAME.dbh, on the computer the studio runs on", visible=False
+        )
+        self._copy = gui.add_button("Save a copy", icon=viser.Icon.COPY, color="green", visible=False)
+        tab.worker.on_click(self._copy, self._save_copy)
         self._check = gui.add_html("")
         self._up = gui.add_dropdown("Up in the file", (_UP_AS_FOUND, *UP_AXES), visible=False, hint="turns the cloud")
         tab.worker.on_update(self._up, self._set_up)
@@ -56,11 +65,14 @@ class OpenPanel(Panel):
         session = self.tab.session
         set_visible(self._up, session is not None)
         if session is None:
+            self._offer_copy(None)
             set_content(self._check, html.message(f"Reads {self.tab.studio.formats()}.", level="ok"))
             return
         if session is not self._session_shown:  # later refreshes leave alone what is being typed
             self._session_shown = session
             set_value(self._path, str(session.document.source.path))
+            set_value(self._copy_folder, "")
+        self._offer_copy(session)
         set_value(self._up, _up_title(session))
         check = session.data_check
         items = [("warn", note, "") for note in session.reopening_notes]
@@ -75,6 +87,23 @@ class OpenPanel(Panel):
         set_content(self._check, verdict + html.findings(items))
 
     _session_shown: object = None
+
+    def _offer_copy(self, session: Session | None) -> None:
+        """Offer to go on elsewhere where the plot cannot be changed, or not be saved, where it is."""
+        is_stuck = session is not None and (session.is_read_only or bool(self.tab.studio.save_problem()))
+        if is_stuck and not self._copy_folder.value:
+            set_value(self._copy_folder, str(self.tab.studio.place_for_copy()))
+        set_visible(self._copy_folder, is_stuck)
+        set_visible(self._copy, is_stuck)
+
+    def _save_copy(self) -> None:
+        text = str(self._copy_folder.value).strip().strip("\"'")
+        if not text:
+            raise StudioError("No folder was named.", "Type where the copy is to be saved.")
+        # os.path, not pathlib: that one raises where there is no such user.
+        folder = Path(os.path.expanduser(text))  # noqa: PTH111
+        self.tab.studio.save_copy(folder if folder.suffix == FOLDER_SUFFIX else Path(f"{folder}{FOLDER_SUFFIX}"))
+        set_value(self._copy_folder, "")
 
     def set_busy(self, busy: bool) -> None:
         """One plot at a time."""
