@@ -127,9 +127,9 @@ class Case:
     arc_deg: float
 
 
-def make_case(name: str, seed: int) -> Case:
-    """The stem of a scenario and a seed."""
-    scenario = SCENARIOS[name]
+def make_case(name: str, seed: int, scenario: Scenario | None = None) -> Case:
+    """The stem of a scenario and a seed; seen as another scenario says, where one is given."""
+    scenario = SCENARIOS[name] if scenario is None else scenario
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     stem = stem_of(scenario, seed, rng)
     n_points = int(_log_uniform(rng, scenario.points))

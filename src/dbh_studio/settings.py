@@ -269,18 +269,26 @@ class MeasureSettings(SettingsModel):
         0.016, "Roundness", unit="radii", gt=0.0, le=0.5, help="shrinkage: expected size of an oval; smaller is rounder"
     )
     bark_share: float = setting(
-        0.007,
+        0.011,
         "Bark under the tape",
         ge=0.0,
         le=0.1,
         help="shrinkage, circle: a tape lies on the bark's ridges, a curve runs through their middle; relative",
     )
     bloat_chance: float = setting(
-        0.05,
+        0.2,
         "Chance of bloat",
         ge=0.0,
         lt=1.0,
-        help="shrinkage, circle: that bark is smeared outwards, before looking; 0: never",
+        help="shrinkage, circle: that bark is smeared outwards far more than usual, before looking; 0: never",
+    )
+    bloat_m: float = setting(
+        0.001,
+        "Usual bloat",
+        unit="m",
+        ge=0.0,
+        le=0.1,
+        help="shrinkage, circle: by how much points lie outside the bark on average; 0: not at all",
     )
     min_diameter_cm: float = setting(2.0, "Smallest diameter", unit="cm", ge=0.5, le=100.0)
     max_diameter_cm: float = setting(300.0, "Largest diameter", unit="cm", ge=10.0, le=1500.0)
@@ -335,19 +343,22 @@ class EstimatorSettings(SettingsModel):
     )
     taper_sd: float = setting(0.004, "Spread of taper", unit="m/m", gt=0.0, le=0.1)
     bark_share: float = setting(
-        0.007,
+        0.011,
         "Bark under the tape",
         ge=0.0,
         le=0.1,
         help="expected share of the diameter by which a tape on the ridges exceeds the curve; visible bark decides",
     )
     bloat_chance: float = setting(
-        0.05, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared outwards, before looking; 0: never"
+        0.2, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared far more than usual; 0: never"
+    )
+    bloat_m: float = setting(
+        0.001, "Usual bloat", unit="m", ge=0.0, le=0.1, help="by how much surfaces are smeared outwards, on average"
     )
     max_points: int = setting(2500, "Most points used", ge=200, le=1_000_000)
-    min_points: int = setting(25, "Fewest points", ge=15, le=100_000)
+    min_points: int = setting(30, "Fewest points", ge=15, le=100_000)
     min_arc_deg: float = setting(
-        100.0, "Smallest arc seen", unit="°", ge=0.0, le=360.0, help="with less of the ring seen no diameter is given"
+        90.0, "Smallest arc seen", unit="°", ge=0.0, le=360.0, help="with less of the ring seen no diameter is given"
     )
     max_half_width: float = setting(
         0.40, "Widest interval", gt=0.01, le=2.0, help="half the 90 % interval, relative; wider is refused"
@@ -359,7 +370,7 @@ class EstimatorSettings(SettingsModel):
         0.9, "Most like clutter", gt=0.0, le=1.0, help="chance of being no stem; with more it is refused; 1: never"
     )
     min_diameter_cm: float = setting(2.0, "Smallest diameter", unit="cm", ge=0.5, le=100.0)
-    max_diameter_cm: float = setting(250.0, "Largest diameter", unit="cm", ge=10.0, le=1500.0)
+    max_diameter_cm: float = setting(300.0, "Largest diameter", unit="cm", ge=10.0, le=1500.0)
     seed: int = setting(0, "Random seed", ge=0, le=2**31 - 1)
 
 

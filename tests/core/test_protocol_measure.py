@@ -17,7 +17,7 @@ from dbh_studio.core.swelling import profile_flag
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import MeasureSettings
 
-SMOOTH = MeasureSettings(bark_share=0.0)
+SMOOTH = MeasureSettings(bark_share=0.0, bloat_m=0.0)
 ANGLE = np.arange(72) * (2 * np.pi / 72)
 
 

@@ -48,7 +48,7 @@ class TestTwoStems:
     def test_the_one_with_most_points_is_measured_and_both_are_told(self, gap_m, ratio):
         apart = 0.15 * (1 + ratio) + gap_m
         points = np.concatenate([pipe(), pipe(apart, radius=0.15 * ratio, n=1200, seed=1)])
-        result = estimate_diameter(points, settings=EstimatorSettings(bark_share=0.0))
+        result = estimate_diameter(points, settings=EstimatorSettings(bark_share=0.0, bloat_m=0.0))
         assert isinstance(result, EstimatorResult), result
         assert result.dbh_cm == pytest.approx(30.0, rel=0.03)
         assert "neighbour" in codes(result)
@@ -180,7 +180,7 @@ class TestHeaps:
         ]
         assert sum(each.refusal is None for each in found) <= 14
         refused = [each.refusal for each in found if each.refusal is not None]
-        assert sum(each.code in ("clutter", "no_ring") for each in refused) >= 0.8 * len(refused)
+        assert sum(each.code in ("clutter", "no_ring") for each in refused) >= 0.75 * len(refused)
 
     def test_words(self, lab):
         refusal = assess_stem(lab.make_heap("slash", 851)).refusal

@@ -10,7 +10,7 @@ from dbh_studio.core.measured import Diameter
 from dbh_studio.core.stem_profile import ProfilePoint, breast_height_flag, stem_profile
 from dbh_studio.settings import MeasureSettings
 
-SMOOTH = MeasureSettings(bark_share=0.0)
+SMOOTH = MeasureSettings(bark_share=0.0, bloat_m=0.0)
 
 
 def stem(*, taper=0.01, z=(0.2, 3.0), arc_deg=360.0, n=9000, seed=0):

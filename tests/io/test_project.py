@@ -428,6 +428,20 @@ def test_schema_1_is_read_for_ever(tmp_path):
     assert same(read_project(folder), state)
 
 
+def test_a_plot_from_before_usual_bloat_was_taken_off_is_measured_as_it_was(tmp_path):
+    for saved, expected in (
+        ({"bark_share": 0.007}, 0.0),
+        ({}, 0.001),
+        ({"bark_share": 0.007, "bloat_m": 0.002}, 0.002),
+    ):
+        folder = tmp_path / f"{expected}.dbh"
+        folder.mkdir()
+        content = json.loads(GOLDEN) | {"settings": {"measure": saved}}
+        (folder / "project.json").write_text(json.dumps(content))
+        _trunks()(folder)
+        assert read_project(folder).settings.measure.bloat_m == expected
+
+
 def test_which_masks_the_trunks_came_from_is_kept_and_moves_along(tmp_path):
     (tmp_path / "old" / "masks").mkdir(parents=True)
     made = MaskRecord(

@@ -45,7 +45,7 @@ def stem(x=0.0, y=0.0, base=0.0, radius=0.2, lean_deg=0.0, z=(0.3, 4.0), n=5000,
     return np.stack([r * np.cos(t), r * np.sin(t), w], axis=1) @ tilt.T + [x, y, base]
 
 
-SMOOTH = MeasureSettings(bark_share=0.0)
+SMOOTH = MeasureSettings(bark_share=0.0, bloat_m=0.0)
 """The stems here have no bark: what is fitted is what a tape would lie on."""
 
 

@@ -47,6 +47,7 @@ def estimator_settings(settings: MeasureSettings, method: str) -> EstimatorSetti
         roundness=settings.roundness,
         bark_share=settings.bark_share,
         bloat_chance=settings.bloat_chance,
+        bloat_m=settings.bloat_m,
         min_points=max(15, settings.min_points),
         min_arc_deg=settings.min_coverage_deg,
         max_half_width=settings.max_half_width,

@@ -289,7 +289,13 @@ class PlotState:
 def migrated(content: dict[str, Any]) -> dict[str, Any]:
     """What an earlier program wrote, as this one would have."""
     # Each version so far has only added what may be absent.
-    return content | {"schema_version": SCHEMA_VERSION}
+    content = content | {"schema_version": SCHEMA_VERSION}
+    settings = content.get("settings")
+    measure = settings.get("measure") if isinstance(settings, dict) else None
+    if isinstance(settings, dict) and isinstance(measure, dict) and "bark_share" in measure:
+        # The bark under the tape was set low to make up for bloat that was not taken off: one goes with the other.
+        content["settings"] = settings | {"measure": {"bloat_m": 0.0} | measure}
+    return content
 
 
 def camera_place(folder: Path, saved: SavedCameras) -> CameraPlace:

@@ -12,10 +12,11 @@ from dbh_studio.core.arrays import Float64, as_points, finite_points, finite_row
 from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.estimator.bark import bark_share
 from dbh_studio.core.estimator.circle import circle_tube
-from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, evidence_of, flags_of, oval_of
+from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, bulge_share, evidence_of, flags_of, oval_of
 from dbh_studio.core.estimator.fit import fit_tube
 from dbh_studio.core.estimator.heap import HeapSigns, heap_signs_of
-from dbh_studio.core.estimator.interval import CALIBRATIONS, Calibration, Spread
+from dbh_studio.core.estimator.interval import CALIBRATIONS, HALF_90, Calibration, Spread
+from dbh_studio.core.estimator.passes import Passes, is_suspect, passes_of
 from dbh_studio.core.estimator.posterior import N_OUTLINE, Patches, Posterior, patches_of, posterior_of
 from dbh_studio.core.estimator.prior import StemPrior
 from dbh_studio.core.estimator.refusals import (
@@ -237,6 +238,7 @@ class _Found:
     method: str
     signs: HeapSigns | None
     others: tuple[OtherStem, ...] = ()
+    passes: Passes | None = None
 
 
 def _fitted(stems: Stems, settings: EstimatorSettings, seed: int) -> _Found | Refusal:
@@ -262,8 +264,10 @@ def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings
     local, start, is_ring = stems.points, stems.main, method == "ring"
     curve = fit_tube(local, start, prior)
     tube = curve if is_ring else circle_tube(local, start, prior, settings, seed=seed)
-    patches = None if tube is None else patches_of(local, tube, bloat_chance=settings.bloat_chance)
-    if tube is None or patches is None:
+    if tube is None:
+        return None
+    patches = patches_of(local, tube, bloat_chance=settings.bloat_chance, bloat_m=settings.bloat_m)
+    if patches is None:
         return None
     posterior = posterior_of(patches, tube, prior if is_ring else replace(prior, highest=1), seed=seed)
     tube = posterior.tube if is_ring else replace(tube, radius=tube.radius + patches.shift_m)
@@ -271,7 +275,27 @@ def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings
     if evidence is None:
         return None
     signs = None if curve is None else heap_signs_of(local, curve, prior)
-    return _Found(local, tube, posterior, patches, evidence, method, signs, stems.others)
+    passes = _passes(local, tube, evidence, prior, settings) if is_ring else None
+    return _Found(local, tube, posterior, patches, evidence, method, signs, stems.others, passes)
+
+
+def _passes(
+    local: Float64, tube: Tube, evidence: Evidence, prior: StemPrior, settings: EstimatorSettings
+) -> Passes | None:
+    """The section as passes that do not fit together; None where nothing speaks for them."""
+    oval = oval_of(tube)
+    if not is_suspect(tube, gap_deg=evidence.gap_deg, wall_ratio=evidence.wall_ratio, oval=oval):
+        return None
+    return passes_of(
+        local,
+        tube,
+        prior,
+        gap_deg=evidence.gap_deg,
+        wall_ratio=evidence.wall_ratio,
+        oval=oval,
+        bloat_chance=settings.bloat_chance,
+        bloat_m=settings.bloat_m,
+    )
 
 
 def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _Told) -> Assessment:
@@ -279,6 +303,9 @@ def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _
     logs = dict(found.posterior.quantiles)
     if found.method == "circle":  # its own radius, with the width of a round tube's posterior
         logs = {name: _moved_to(values, np.log(2.0 * found.tube.radius)) for name, values in logs.items()}
+    if found.passes is not None:
+        shift = found.passes.log_shift(logs["area"][1])
+        logs = {name: _moved_to(values, values[1] + shift) for name, values in logs.items()}
     bark, _ = bark_share(found.points, found.tube, expected=settings.bark_share)
     logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(bark))
     calibration = CALIBRATIONS[found.method]
@@ -304,9 +331,9 @@ def _refusal(
         return too_shallow(found.evidence, spread.sigma_m)
     if not settings.min_diameter_cm <= chosen.value_cm <= settings.max_diameter_cm:
         return implausible(chosen, settings)
-    is_wide = CALIBRATIONS[found.method].factor * log_sd > settings.max_half_width
+    is_wide = HALF_90 * log_sd > settings.max_half_width
     if is_wide or found.evidence.arc_deg < settings.min_arc_deg:
-        return too_uncertain(found.evidence, chosen)
+        return too_uncertain(found.evidence, chosen, settings)
     return None
 
 
@@ -371,17 +398,22 @@ def _spread(logs: tuple[float, float, float], found: _Found) -> Spread:
     return Spread(
         posterior=(logs[2] - logs[0]) / 3.29,
         sigma_m=found.tube.sigma,
+        outline_m=float(found.posterior.outline_sd_m.mean()),
+        scatter_m=found.patches.scatter_m,
+        n_points=evidence.n_points,
         gap=evidence.gap_deg / 360.0,
-        bloat_m=float(np.hypot(found.patches.shift_m, found.patches.shift_sd_m)),
         waves=oval_of(found.tube),
         wall_ratio=evidence.wall_ratio,
-        wall_m=evidence.wall_m,
         diameter_m=float(np.exp(logs[1])),
+        passes=0.0 if found.passes is None else found.passes.probability,
+        apart=0.0 if found.passes is None else found.passes.separation_m / float(np.exp(logs[1])),
+        # A circle is of the points just there, and follows a swelling.
+        bulge=bulge_share(evidence, found.tube) if found.method == "ring" else 0.0,
     )
 
 
 def _diameter(log_m: float, calibration: Calibration, spread: Spread, told: _Told) -> Diameter:
-    half = calibration.factor * calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
+    half = HALF_90 * calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
     return Diameter(
         100.0 * float(np.exp(log_m)), 100.0 * float(np.exp(log_m - half)), 100.0 * float(np.exp(log_m + half))
     )

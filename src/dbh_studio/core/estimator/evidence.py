@@ -143,7 +143,7 @@ def flags_of(
     if drift_chance > _DRIFT_TO_MENTION:
         words = f"bark {evidence.wall_ratio:.1f} times thicker on some sides: double wall, passes may not fit together"
         flags.append(Flag("double_wall", words))
-    if abs(evidence.bulge_m) > max(0.03 * tube.radius, 0.004) + 2.0 * evidence.bulge_sd_m:
+    if bulge_share(evidence, tube) > 0:
         word = "bulges out" if evidence.bulge_m > 0 else "is narrower"
         words = f"the stem {word} by {1000 * abs(evidence.bulge_m):.0f} mm here (whorl, scar): measure above or below"
         flags.append(Flag("bulge", words))
@@ -165,6 +165,12 @@ def flags_of(
     if evidence.stretch_m < _SHORT_STRETCH_M:
         flags.append(Flag("short_stretch", f"only {evidence.stretch_m:.1f} m of stem seen: lean and taper are guesses"))
     return tuple(flags)
+
+
+def bulge_share(evidence: Evidence, tube: Tube) -> float:
+    """By how much of its radius a stem is thicker or narrower at breast height than its taper says; 0 if not surely."""
+    least = max(0.03 * tube.radius, 0.004) + 2.0 * evidence.bulge_sd_m
+    return abs(evidence.bulge_m) / tube.radius if abs(evidence.bulge_m) > least else 0.0
 
 
 def _beside(others: tuple[OtherStem, ...]) -> list[Flag]:
@@ -249,7 +255,7 @@ def _walls(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
     if len(widths) < 4:
         return 1.0, 0.0
     thin, thick = quantiles(np.array(widths), (0.15, 0.9))
-    return thick / max(thin, 1e-4), float(np.sqrt(max(thick**2 - thin**2, 0.0)))
+    return max(thick, 1e-4) / max(thin, 1e-4), float(np.sqrt(max(thick**2 - thin**2, 0.0)))
 
 
 def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:

@@ -1,18 +1,18 @@
 """From a posterior to an interval that holds the truth nine times in ten.
 
 The posterior knows the noise and the arc, not what the model leaves out: errors that a whole side shares, walls that do
-not meet, bark a tape bridges. So the standard deviation of the logarithm of the diameter D is taken as
+not meet, bark a tape bridges. How far the logarithm of the diameter D is really off follows from what a fit shows of
+itself (`Spread.terms`): its posterior's width, the noise, how uncertain the outline is, the gap, how deep the seen arc
+is beside its noise, by how much patches of bark differ, the size, and whether passes of the camera or scanner fit
+together. The logarithm of the interval's half width is a linear function of these,
 
-    s² = c₀² + (c₁ h)² + (c₂ σ/D)² + c₃² (g / (1 - g))³ + (c₄ b/D)² + p² ((c₅ v)² + (c₆ q/D)² + c₇²) + (c₈ (τ - σ/D))²
-         + s_scale² + (drift/D)²
+    ln h = c₀ + Σ cᵢ tᵢ,     each tᵢ held within what the stems showed that the coefficients were found on,
 
-with h the posterior's own (half of its 5-95 % range over 1.645), σ the noise of points, g the largest gap as a share of
-the ring, b the bloat taken off with its uncertainty, and τ the noise relative to how deep the seen arc is
-(`depth_noise`: once that is no longer small, an arc of any curvature agrees with the points; of a whole ring it is σ/D,
-so the term counts what the arc adds). p is the probability that passes do not fit together, from how much thicker the
-bark's layer is on some sides (q) and from the size of the outline's waves (v).
+and never less than the posterior's own. A product in place of a sum of squares can also say where an interval may be
+*narrower*: the terms that make one stem uncertain are small on many that look alike otherwise. A swelling just at
+breast height, and the uncertainty of the scale and of passes if it is known from elsewhere, are added as variances.
 
-The coefficients were found on generated stems with development seeds (`bench/estimator_lab.py --calibrate`): quantile
+The coefficients were found on generated stems with development seeds (`bench/estimator_calibrate.py`): quantile
 regression in which every scenario counts alike and what is asked for is nine in ten in each of them, not on the whole.
 
 Passes that are off by more than their noise and hardly overlap show neither two walls nor an odd section. No estimator
@@ -27,7 +27,30 @@ import numpy as np
 
 from dbh_studio.core.arrays import Float64
 
+TERMS = (
+    "one",
+    "posterior",
+    "noise",
+    "outline",
+    "gap",
+    "depth",
+    "scatter",
+    "size",
+    "walls",
+    "drift",
+    "drift_waves",
+    "passes",
+    "passes_apart",
+    "points",
+)
+"""What the coefficients are multiplied with, in this order; see `Spread.terms`."""
+
+HALF_90 = 1.645
+"""Standard deviations to either end of a 90 % interval."""
+
 _LEAST_WAVE = 0.003
+_LEAST_SD = 0.003
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -37,22 +60,32 @@ class Spread:
     Attributes:
         posterior: Standard deviation of ln D by the posterior.
         sigma_m: Noise of points across the bark.
+        outline_m: Mean standard deviation of the outline's radius by the posterior.
+        scatter_m: By how much patches of bark differ beyond the noise of their points.
+        n_points: On the bark.
         gap: Largest unseen sector as a share of the ring, 0-1.
-        bloat_m: How far the surface was drawn in, and how uncertain that is.
         waves: Root mean square of the outline's second and third wave, relative to its radius.
         wall_ratio: How many times thicker the layer of points is on its thick sides than on its thin ones.
-        wall_m: By how much.
         diameter_m: D.
+        passes: Probability of passes that do not fit together by the walls they leave (`passes`); 0 where none was
+            looked for.
+        apart: How far they are apart, relative to D.
+        bulge: By how much of its radius the stem is surely thicker or narrower just there, which the curve, fitted to a
+            taller stretch of stem, does not follow; 0 mostly.
     """
 
     posterior: float
     sigma_m: float
+    outline_m: float
+    scatter_m: float
+    n_points: int
     gap: float
-    bloat_m: float
     waves: float
     wall_ratio: float
-    wall_m: float
     diameter_m: float
+    passes: float = 0.0
+    apart: float = 0.0
+    bulge: float = 0.0
 
     @property
     def depth_noise(self) -> float:
@@ -61,19 +94,29 @@ class Spread:
         return float(self.sigma_m / (0.5 * self.diameter_m * (1.0 - np.cos(seen))))
 
     def terms(self, drift: float) -> Float64:
-        """(9,) what the coefficients are multiplied with, given the probability that passes do not fit together."""
-        gap = min(self.gap, 0.95)
+        """(14,) what the coefficients are multiplied with, `TERMS`.
+
+        Args:
+            drift: Probability that passes do not fit together.
+        """
+        lengths = np.array([self.sigma_m, self.outline_m, self.scatter_m]) / self.diameter_m
+        noise, outline, scatter = np.log(np.maximum(lengths, _LEAST))
         return np.array(
             [
                 1.0,
-                self.posterior,
-                self.sigma_m / self.diameter_m,
-                (gap / (1.0 - gap)) ** 1.5,
-                self.bloat_m / self.diameter_m,
-                drift * self.waves,
-                drift * self.wall_m / self.diameter_m,
+                np.log(self.posterior + _LEAST_SD),
+                noise,
+                outline,
+                self.gap**2,
+                np.log(max(self.depth_noise, _LEAST)),
+                scatter,
+                np.log(self.diameter_m),
+                np.log(max(self.wall_ratio, 1.0)),
                 drift,
-                max(self.depth_noise - self.sigma_m / self.diameter_m, 0.0),
+                drift * np.log(self.waves + _LEAST_WAVE),
+                self.passes,
+                self.passes * np.log(self.apart + _LEAST_WAVE),
+                np.log(max(self.n_points, 1)),
             ]
         )
 
@@ -83,20 +126,22 @@ class Calibration:
     """How much each term counts.
 
     Attributes:
-        coefficients: (9,) c₀ … c₈.
+        coefficients: (14,) of `TERMS`.
+        lowest: (14,) of each term, on the stems that the coefficients were found on.
+        highest: (14,) the same.
         drift: Logistic regression of "passes do not fit together": intercept, and slopes on the logarithms of the
             walls' ratio and of the waves.
-        factor: Standard deviations to either end of the 90 % interval.
     """
 
     coefficients: tuple[float, ...]
+    lowest: tuple[float, ...]
+    highest: tuple[float, ...]
     drift: tuple[float, float, float]
-    factor: float = 1.645
 
     def drift_chance(self, spread: Spread) -> float:
         """Probability that passes do not fit together, where half of all stems were so."""
         start, by_walls, by_waves = self.drift
-        odds = start + by_walls * np.log(spread.wall_ratio) + by_waves * np.log(spread.waves + _LEAST_WAVE)
+        odds = start + by_walls * np.log(max(spread.wall_ratio, 1.0)) + by_waves * np.log(spread.waves + _LEAST_WAVE)
         return float(1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0))))
 
     def log_sd(self, spread: Spread, *, scale_sd: float = 0.0, drift_m: float = 0.0) -> float:
@@ -108,13 +153,42 @@ class Calibration:
             drift_m: How far passes are off, standard deviation per axis. Three passes that see a third of the ring
                 each move the radius by half of that, so the diameter by all of it.
         """
-        told = scale_sd**2 + (drift_m / spread.diameter_m) ** 2
-        terms = spread.terms(self.drift_chance(spread))
-        return float(np.sqrt(((np.array(self.coefficients) * terms) ** 2).sum() + told))
+        terms = np.clip(spread.terms(self.drift_chance(spread)), self.lowest, self.highest)
+        own = max(float(np.exp(terms @ np.array(self.coefficients))) / HALF_90, spread.posterior)
+        swollen = spread.bulge / HALF_90
+        return float(np.sqrt(own**2 + swollen**2 + scale_sd**2 + (drift_m / spread.diameter_m) ** 2))
 
 
+# fmt: off
 CALIBRATIONS = {
-    "ring": Calibration((0.00578, 1.4, 0.189, 0.0104, 0.551, 1.97, 0.462, 0.0174, 1.27), (1.62, 5.65, 1.52)),
-    "circle": Calibration((0.00482, 2.68, 0.0549, 0.0165, 2.11, 0.0, 0.711, 0.01, 2.95), (-4.08, 5.9, 0.0)),
+    "ring": Calibration(
+        coefficients=(
+            6.875, 0.439, 0.2368, -0.1492, 3.088, 0.5485, 0.5141,
+            0.6298, -1.177, 4.963, 0.7474, 0.8833, 0.163, -0.4234,
+        ),
+        lowest=(
+            1.0, -5.656, -5.587, -6.908, 0.0, -5.587, -6.244,
+            -2.786, 0.0, 0.003026, -3.57, 0.0, -3.31, 4.605,
+        ),
+        highest=(
+            1.0, -2.591, -1.951, -3.28, 0.5216, -1.923, -3.711,
+            -0.09252, 1.395, 0.9869, -0.01672, 0.9878, -0.0, 7.806,
+        ),
+        drift=(1.903, 5.131, 1.474)),
+    "circle": Calibration(
+        coefficients=(
+            4.218, -0.2006, 0.5182, 0.03333, 3.924, 0.6181, 0.4353,
+            0.6139, -4.297, 3.017, -0.5193, 0.0, 0.0, -0.1801,
+        ),
+        lowest=(
+            1.0, -5.674, -5.589, -8.057, 0.0, -5.589, -6.142,
+            -2.793, 0.0, 0.02251, -5.622, 0.0, -0.0, 4.615,
+        ),
+        highest=(
+            1.0, -2.958, -1.962, -3.744, 0.5216, -1.928, -3.357,
+            -0.106, 1.323, 0.9677, -0.1308, 0.0, 0.0, 7.809,
+        ),
+        drift=(-3.771, 5.422, 0.0)),
 }
-"""By method."""
+# fmt: on
+"""By method; printed by `bench/estimator_calibrate.py`."""

@@ -71,13 +71,14 @@ class Posterior:
     width: float
 
 
-def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0) -> Patches | None:
+def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0, bloat_m: float = 0.0) -> Patches | None:
     """The points on the tube as patches, drawn in where the bark is bloated; None with too few points or patches.
 
     Args:
         points: (N, 3) points, as the tube was fitted to.
         tube: The fit.
-        bloat_chance: Prior probability of bloat, see `skew.surface_shift`.
+        bloat_chance: Prior probability of more bloat than usual, see `skew.surface_shift`.
+        bloat_m: The usual one.
     """
     near = near_surface(points, tube)
     if near is None:
@@ -94,7 +95,7 @@ def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0) -> Pat
     used = total > 0.3
     if used.sum() < 6:
         return None
-    shift, shift_sd = surface_shift(near.error, tube.sigma, chance=bloat_chance)
+    shift, shift_sd = surface_shift(near.error, tube.sigma, chance=bloat_chance, usual_m=bloat_m)
     parts = np.stack([at.cos, at.sin, at.distance + shift, at.along])
     mean = np.stack([np.bincount(cell, weight * row, n_cells) for row in parts])[:, used] / total[used]
     off = np.bincount(cell, weight * error, n_cells)[used] / total[used]

@@ -75,10 +75,10 @@ def two_rings(main: Tube, others: tuple[OtherStem, ...], settings: EstimatorSett
     return Refusal("two_rings", reason, "Split it by stems, or remove the points of the other one.")
 
 
-def too_uncertain(evidence: Evidence, chosen: Diameter) -> Refusal:
+def too_uncertain(evidence: Evidence, chosen: Diameter, settings: EstimatorSettings) -> Refusal:
     """Why a diameter that is known too badly is not given."""
     between = f"anything from {chosen.low_cm:.0f} to {chosen.high_cm:.0f} cm would agree with the points"
-    if evidence.gap_deg >= _ARC_GAP_DEG:
+    if evidence.gap_deg >= _ARC_GAP_DEG or evidence.arc_deg < settings.min_arc_deg:
         return Refusal("small_arc", f"Only {evidence.arc_deg:.0f}° of the ring seen: {between}.", _REMEDY)
     return Refusal("too_uncertain", f"The points are too few or too scattered; {between}.", _REMEDY)
 
