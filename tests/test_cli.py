@@ -436,9 +436,10 @@ def test_a_plot_that_is_being_written_is_left_alone(las, saved, tmp_path, capsys
 
 def stuck(step: str) -> str:
     """Python that makes `run` say so, and hang, where it comes to a step."""
+    # Many short sleeps: a signal that comes just before a sleep begins, or to another thread, is told when it ends.
     return (
         "import time\nfrom dbh_studio.app import pipeline\n"
-        f"pipeline.{step} = lambda *_, **__: (print('here', flush=True), time.sleep(120))"
+        f"pipeline.{step} = lambda *_, **__: (print('here', flush=True), [time.sleep(0.05) for _ in range(2400)])"
     )
 
 

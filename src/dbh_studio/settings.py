@@ -572,8 +572,10 @@ def describe_settings() -> str:
         assert isinstance(model, type) and issubclass(model, SettingsModel)
         for name, field in model.model_fields.items():
             extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-            bounds = {key: getattr(rule, key) for rule in field.metadata for key in ("ge", "le") if hasattr(rule, key)}
-            limits = f" [{bounds.get('ge', '')}..{bounds.get('le', '')}]" if bounds else ""
+            kinds = ("ge", "gt", "le", "lt")
+            bounds = {key: getattr(rule, key) for rule in field.metadata for key in kinds if hasattr(rule, key)}
+            lowest, highest = (bounds.get(a, bounds.get(b, "")) for a, b in (("ge", "gt"), ("le", "lt")))
+            limits = f" [{lowest}..{highest}]" if bounds else ""
             choices = get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
             limits += f" [{' | '.join(map(str, choices))}]" if choices else ""
             text = f"{field.title}{': ' + field.description if field.description else ''}"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Bool, Float64, Int64, readonly
+from dbh_studio.core.arrays import Bool, Float64, Int64, finite_points, readonly
 from dbh_studio.core.medians import group_medians
 from dbh_studio.core.robust import tukey_weight
 from dbh_studio.core.section import radius_at
@@ -67,7 +67,8 @@ def stem_course(
     outline_radius = _by_angle(outline_uv_m)
     z = points_m[:, 2]
     inside = np.flatnonzero((z > max(LOWEST_M, z0 - reach_m)) & (z < z0 + reach_m))  # NaN is nowhere
-    local = frame.inverse().apply(_thinned(points_m.take(inside, axis=0)).astype(np.float64))
+    some = finite_points(_thinned(points_m.take(inside, axis=0))).astype(np.float64)
+    local = frame.inverse().apply(some)
     radius = np.sqrt(local[:, 0] ** 2 + local[:, 1] ** 2)
     near = np.flatnonzero(radius < _GATE[1] * float(outline_radius.max()))
     (x, y, along), radius = local[near].T, radius[near]

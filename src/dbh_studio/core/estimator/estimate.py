@@ -41,6 +41,7 @@ from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
+_FURTHEST_M = 1e9  # from the origin: beyond any survey coordinate, and squares stay finite
 _SURE_RING = 0.05  # standard deviation of a ring's points, relative to its radius, where none is told
 
 
@@ -58,7 +59,8 @@ def estimate_diameter(
 
     Args:
         points_m: (N, 3) points of the stem and what is around it, metres; z is the height above the ground at the
-            stem. What is not finite, or outside the stretch of stem used, is left out.
+            stem. What is not finite, or outside the stretch of stem used, or farther than 10⁹ m from the
+            origin, is left out.
         settings: Method, stretch, priors, limits.
         scale_sd: Relative standard error of the cloud's scale; widens the interval.
         drift_m: How far passes over the stem do not fit together, standard deviation per axis where it is known from
@@ -175,11 +177,13 @@ def heap_signs(
 
 
 def _window(points: NDArray[np.floating[Any]], settings: EstimatorSettings) -> Float64:
-    """(N, 3) finite points of the stretch of stem used."""
+    """(N, 3) points of the stretch of stem used; none that is not finite, or absurdly far away."""
     low, high = _stretch(settings)
     height = points[:, 2]
     rows = np.flatnonzero(finite_rows(points) & (height >= low) & (height <= high))
-    return points.take(rows, axis=0).astype(np.float64)
+    used = points.take(rows, axis=0).astype(np.float64)
+    is_near = np.abs(used[:, :2]) <= _FURTHEST_M
+    return used if is_near.all() else used[is_near.all(axis=1)]
 
 
 def _stretch(settings: EstimatorSettings) -> tuple[float, float]:
@@ -303,18 +307,25 @@ def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _
     logs = dict(found.posterior.quantiles)
     if found.method == "circle":  # its own radius, with the width of a round tube's posterior
         logs = {name: _moved_to(values, np.log(2.0 * found.tube.radius)) for name, values in logs.items()}
+    bark, _ = bark_share(found.points, found.tube, expected=settings.bark_share)
+    logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(bark))
     if found.passes is not None:
         shift = found.passes.log_shift(logs["area"][1])
         logs = {name: _moved_to(values, values[1] + shift) for name, values in logs.items()}
-    bark, _ = bark_share(found.points, found.tube, expected=settings.bark_share)
-    logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(bark))
-    calibration = CALIBRATIONS[found.method]
+        found = replace(found, tube=found.tube.larger(float(np.exp(shift))))
+    calibration = _calibration(found, settings)
     spreads = {name: _spread(values, found) for name, values in logs.items()}
     diameters = {name: _diameter(logs[name][1], calibration, spread, told) for name, spread in spreads.items()}
     spread = spreads[settings.definition]
     log_sd = calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
     result = _result(found, origin, settings, diameters, spread, log_sd)
     return Assessment(result, _refusal(found, settings, diameters[settings.definition], spread, log_sd))
+
+
+def _calibration(found: _Found, settings: EstimatorSettings) -> Calibration:
+    """Of the method; a circle about an upright axis has one of its own."""
+    is_upright = found.method == "circle" and settings.axis == "vertical"
+    return CALIBRATIONS["circle, upright" if is_upright else found.method]
 
 
 def _refusal(
@@ -356,7 +367,7 @@ def _result(
         tube,
         lean_deg=lean,
         beside=found.others,
-        drift_chance=CALIBRATIONS[found.method].drift_chance(spread),
+        drift_chance=_calibration(found, settings).drift_chance(spread),
         signs=found.signs,
     )
     if found.method != settings.method:

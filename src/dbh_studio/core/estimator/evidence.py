@@ -54,7 +54,6 @@ class Evidence:
         stretch_m: Length of stem that was seen.
         off_m: How far breast height is from it; 0 inside.
         wall_ratio: How many times thicker the layer of points is on its thick sides than on its thin ones.
-        wall_m: By how much, standard deviation.
         bulge_m: How far the stem at breast height stands out of the taper of the rest; negative for a waist.
         bulge_sd_m: Standard deviation of that.
         contrast: 1 where there is nothing in the layers next to the surface, 0 where they are as dense as it.
@@ -69,7 +68,6 @@ class Evidence:
     stretch_m: float
     off_m: float
     wall_ratio: float
-    wall_m: float
     bulge_m: float
     bulge_sd_m: float
     contrast: float
@@ -107,7 +105,7 @@ def evidence_of(points: Float64, tube: Tube) -> Evidence | None:
         np.repeat(seen, N_OUTLINE // len(seen)),
         high - low,
         max(low, -high, 0.0),
-        *_walls(near.at, near.error, tube),
+        _wall_ratio(near.at, near.error, tube),
         bulge,
         bulge_sd,
         *_contrast_and_filled(points, tube, arc_deg),
@@ -233,8 +231,8 @@ def _contrast_and_filled(points: Float64, tube: Tube, arc_deg: float) -> tuple[f
     return contrast, float(inside / (np.pi * inner**2) * ring_m2 / on)
 
 
-def _walls(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
-    """How many times thicker the bark's layer of points is on its thick sides than on its thin ones, and by how much.
+def _wall_ratio(at: Polar, error: Float64, tube: Tube) -> float:
+    """How many times thicker the bark's layer of points is on its thick sides than on its thin ones.
 
     Passes that do not fit together leave two walls where they overlap and one where one of them saw the stem alone.
     Windows of 30° overlap by a third, so that no boundary of windows cuts a double wall in two.
@@ -253,9 +251,9 @@ def _walls(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:
             piece = off[first:last]
             widths.append(1.4826 * median(np.abs(piece - median(piece))))
     if len(widths) < 4:
-        return 1.0, 0.0
+        return 1.0
     thin, thick = quantiles(np.array(widths), (0.15, 0.9))
-    return max(thick, 1e-4) / max(thin, 1e-4), float(np.sqrt(max(thick**2 - thin**2, 0.0)))
+    return max(thick, 1e-4) / max(thin, 1e-4)
 
 
 def _bulge(at: Polar, error: Float64, tube: Tube) -> tuple[float, float]:

@@ -189,6 +189,20 @@ CALIBRATIONS = {
             -0.106, 1.323, 0.9677, -0.1308, 0.0, 0.0, 7.809,
         ),
         drift=(-3.771, 5.422, 0.0)),
+    "circle, upright": Calibration(
+        coefficients=(
+            5.7, 0.2739, -0.3223, 0.5122, -0.554, 0.005239, 0.559,
+            0.007209, -0.09153, -0.8849, 0.1523, 0.0, 0.0, -0.2698,
+        ),
+        lowest=(
+            1.0, -5.428, -5.234, -7.228, 0.0, -5.16, -6.05,
+            -2.788, 0.0, 0.4111, -3.44, 0.0, -0.0, 4.477,
+        ),
+        highest=(
+            1.0, -2.406, -1.968, -3.108, 0.5017, -1.915, -2.349,
+            -0.1052, 1.617, 0.5922, -2.388, 0.0, 0.0, 7.794,
+        ),
+        drift=(-0.3594, 0.4529, 0.0)),
 }
 # fmt: on
-"""By method; printed by `bench/estimator_calibrate.py`."""
+"""By method, and of the circle about an upright axis; printed by `bench/estimator_calibrate.py`."""

@@ -44,14 +44,12 @@ class Patches:
         variance: (C,) of its distance to the surface, m².
         scatter_m: What differs from patch to patch beyond the noise of points: smooth errors, unmodelled shape.
         shift_m: How far they were drawn in (negative), because the surface is bloated.
-        shift_sd_m: Standard deviation of that.
     """
 
     position: Float64
     variance: Float64
     scatter_m: float
     shift_m: float
-    shift_sd_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +60,11 @@ class Posterior:
         quantiles: Of the natural logarithm of each diameter (``tape``, ``curve``, ``area``): 5 %, 50 %, 95 %.
         tube: The likeliest one.
         outline_sd_m: (72,) standard deviation of the outline's radius.
-        width: Mean of the roundness prior's widths, relative to the setting, by evidence.
     """
 
     quantiles: dict[str, tuple[float, float, float]]
     tube: Tube
     outline_sd_m: Float64
-    width: float
 
 
 def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0, bloat_m: float = 0.0) -> Patches | None:
@@ -95,7 +91,7 @@ def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0, bloat_
     used = total > 0.3
     if used.sum() < 6:
         return None
-    shift, shift_sd = surface_shift(near.error, tube.sigma, chance=bloat_chance, usual_m=bloat_m)
+    shift, _ = surface_shift(near.error, tube.sigma, chance=bloat_chance, usual_m=bloat_m)
     parts = np.stack([at.cos, at.sin, at.distance + shift, at.along])
     mean = np.stack([np.bincount(cell, weight * row, n_cells) for row in parts])[:, used] / total[used]
     off = np.bincount(cell, weight * error, n_cells)[used] / total[used]
@@ -110,7 +106,7 @@ def patches_of(points: Float64, tube: Tube, *, bloat_chance: float = 0.0, bloat_
     # Direction and distance, not x and y: the mean place of an arc's points lies on its chord side.
     mean[:2] *= mean[2] / np.hypot(mean[0], mean[1])
     position = origin + mean[[0, 1, 3]].T @ np.stack([u, v, w])
-    return Patches(position, variance, float(np.sqrt(scatter)), shift, shift_sd)
+    return Patches(position, variance, float(np.sqrt(scatter)), shift)
 
 
 def posterior_of(patches: Patches, tube: Tube, prior: StemPrior, *, seed: int) -> Posterior:
@@ -144,7 +140,7 @@ def posterior_of(patches: Patches, tube: Tube, prior: StemPrior, *, seed: int) -
     found = best[width_at, node_at]
     centre, slope = fitted.place.moved(best[width_at])
     likeliest = Tube(centre[node_at], slope[node_at], float(radii[node_at]), float(found[4]), found[5:], tube.sigma)
-    return Posterior(diameters, likeliest, outline_sd, float(belief.sum(axis=1) @ _WIDTHS))
+    return Posterior(diameters, likeliest, outline_sd)
 
 
 @dataclass(frozen=True, eq=False)

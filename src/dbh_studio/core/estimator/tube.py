@@ -11,7 +11,7 @@ There is no k = 1: it would be a shift of the section, which c already is.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,10 @@ class Tube:
         uy, uz = -wx * wy / ux, -wx * wz / ux
         v = np.array([wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux])
         return np.array([ux, uy, uz]), v, np.array([wx, wy, wz])
+
+    def larger(self, factor: float) -> Tube:
+        """The same with a section so many times as large."""
+        return replace(self, radius=self.radius * factor, waves=self.waves * factor)
 
     def polar(self, points: Float64) -> Polar:
         """Where (N, 3) points are about the axis."""
