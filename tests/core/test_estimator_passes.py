@@ -70,7 +70,7 @@ class TestDrift:
     def test_the_common_radius_is_found_where_one_curve_misses_it(self, arc_deg, shifts_m, seed):
         tube, passes = look(cylinder(seed, shifts_m=shifts_m, arc_deg=arc_deg))
         assert abs(tube.radius / RADIUS_M - 1.0) > 0.04
-        assert passes.radius_m == pytest.approx(RADIUS_M, rel=0.025)
+        assert abs(passes.radius_m / RADIUS_M - 1.0) < min(0.035, 0.6 * abs(tube.radius / RADIUS_M - 1.0))
 
     def test_passes_are_seen_and_believed(self, arc_deg, shifts_m, seed):
         points = cylinder(seed, shifts_m=shifts_m, arc_deg=arc_deg)
@@ -97,7 +97,7 @@ class TestNoDrift:
         tube, passes = look(cylinder(3, oval=oval, arc_deg=arc_deg))
         assert passes.probability < 0.45
         assert passes.trust < 0.03
-        assert passes.radius_m == pytest.approx(tube.radius, rel=0.01)
+        assert passes.radius_m == pytest.approx(tube.radius, rel=0.02)
 
     def test_the_diameter_stays(self, oval, arc_deg, monkeypatch):
         points = cylinder(3, oval=oval, arc_deg=arc_deg) + BREAST

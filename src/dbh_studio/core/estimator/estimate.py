@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dbh_studio.core.arrays import Float64, as_points, finite_points, finite_rows, readonly
+from dbh_studio.core.arrays import Float64, as_points, finite_points, finite_rows
 from dbh_studio.core.axis import StemAxis
-from dbh_studio.core.estimator.bark import bark_share
 from dbh_studio.core.estimator.circle import circle_tube
-from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, bulge_share, evidence_of, flags_of, oval_of
+from dbh_studio.core.estimator.evidence import ODD_SHAPE, Evidence, evidence_of, oval_of
 from dbh_studio.core.estimator.fit import fit_tube
 from dbh_studio.core.estimator.heap import HeapSigns, heap_signs_of
-from dbh_studio.core.estimator.interval import CALIBRATIONS, HALF_90, Calibration, Spread
 from dbh_studio.core.estimator.passes import Passes, is_suspect, passes_of
-from dbh_studio.core.estimator.posterior import N_OUTLINE, Patches, Posterior, patches_of, posterior_of
+from dbh_studio.core.estimator.posterior import patches_of, posterior_of
 from dbh_studio.core.estimator.prior import StemPrior
-from dbh_studio.core.estimator.refusals import (
-    clutter,
-    implausible,
-    no_ring,
-    no_surface,
-    too_few,
-    too_shallow,
-    too_uncertain,
-    two_rings,
-)
+from dbh_studio.core.estimator.refusals import no_ring, too_few
 from dbh_studio.core.estimator.result import EstimatorResult
-from dbh_studio.core.estimator.ring_count import MOST_STEMS, OtherStem, Stems, first_of, stems_of
+from dbh_studio.core.estimator.ring_count import MOST_STEMS, Stems, first_of, stems_of
 from dbh_studio.core.estimator.sample import sample_points
 from dbh_studio.core.estimator.search import search_rings
-from dbh_studio.core.estimator.tube import Tube, wave_basis
-from dbh_studio.core.measured import Diameter, Flag, Refusal, SectionRing
+from dbh_studio.core.estimator.tube import Tube
+from dbh_studio.core.estimator.verdict import Assessment, Found, Told, judged
+from dbh_studio.core.measured import Refusal
 from dbh_studio.core.medians import median
 from dbh_studio.core.robust import Circle
-from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
@@ -77,19 +66,6 @@ def estimate_diameter(
     return found.result
 
 
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """What was found of a stem, and why it is no diameter where it is none.
-
-    Attributes:
-        result: None where nothing round was found.
-        refusal: None where the result may be given.
-    """
-
-    result: EstimatorResult | None
-    refusal: Refusal | None
-
-
 def assess_stem(
     points_m: NDArray[np.floating[Any]],
     *,
@@ -123,7 +99,7 @@ def assess_stem(
     found = no_ring(len(local), settings) if stems is None else _fitted(stems, settings, seed)
     if isinstance(found, Refusal):
         return Assessment(None, found)
-    return _judged(found, origin, settings, _Told(scale_sd, drift_m))
+    return judged(found, origin, settings, Told(scale_sd, drift_m))
 
 
 def stem_line(
@@ -222,30 +198,7 @@ def _start_at(line: StemAxis, ring: Circle, origin: Float64) -> Tube:
     return Tube(line.xy_at(float(origin[2])) - origin[:2], slope, ring.radius_m, 0.0, np.empty(0), ring.sigma_m)
 
 
-@dataclass(frozen=True)
-class _Told:
-    """What the caller knows of errors that a stem's points do not show."""
-
-    scale_sd: float
-    drift_m: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """All that was found of a stem."""
-
-    points: Float64
-    tube: Tube
-    posterior: Posterior
-    patches: Patches
-    evidence: Evidence
-    method: str
-    signs: HeapSigns | None
-    others: tuple[OtherStem, ...] = ()
-    passes: Passes | None = None
-
-
-def _fitted(stems: Stems, settings: EstimatorSettings, seed: int) -> _Found | Refusal:
+def _fitted(stems: Stems, settings: EstimatorSettings, seed: int) -> Found | Refusal:
     """Fit and posterior; the plain circle where the ring's fit fails."""
     prior = StemPrior.from_settings(settings)
     if settings.method == "ring":
@@ -263,7 +216,7 @@ def _fitted(stems: Stems, settings: EstimatorSettings, seed: int) -> _Found | Re
     return no_ring(len(stems.points), settings) if found is None else found
 
 
-def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings, seed: int) -> _Found | None:
+def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings, seed: int) -> Found | None:
     """What one method finds; None where it finds nothing."""
     local, start, is_ring = stems.points, stems.main, method == "ring"
     curve = fit_tube(local, start, prior)
@@ -280,7 +233,7 @@ def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings
         return None
     signs = None if curve is None else heap_signs_of(local, curve, prior)
     passes = _passes(local, tube, evidence, prior, settings) if is_ring else None
-    return _Found(local, tube, posterior, patches, evidence, method, signs, stems.others, passes)
+    return Found(local, tube, posterior, patches, evidence, method, signs, stems.others, passes)
 
 
 def _passes(
@@ -300,136 +253,3 @@ def _passes(
         bloat_chance=settings.bloat_chance,
         bloat_m=settings.bloat_m,
     )
-
-
-def _judged(found: _Found, origin: Float64, settings: EstimatorSettings, told: _Told) -> Assessment:
-    """The result, with a refusal where it says too little or is no tree."""
-    logs = dict(found.posterior.quantiles)
-    if found.method == "circle":  # its own radius, with the width of a round tube's posterior
-        logs = {name: _moved_to(values, np.log(2.0 * found.tube.radius)) for name, values in logs.items()}
-    bark, _ = bark_share(found.points, found.tube, expected=settings.bark_share)
-    logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(bark))
-    if found.passes is not None:
-        shift = found.passes.log_shift(logs["area"][1])
-        logs = {name: _moved_to(values, values[1] + shift) for name, values in logs.items()}
-        found = replace(found, tube=found.tube.larger(float(np.exp(shift))))
-    calibration = _calibration(found, settings)
-    spreads = {name: _spread(values, found) for name, values in logs.items()}
-    diameters = {name: _diameter(logs[name][1], calibration, spread, told) for name, spread in spreads.items()}
-    spread = spreads[settings.definition]
-    log_sd = calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
-    result = _result(found, origin, settings, diameters, spread, log_sd)
-    return Assessment(result, _refusal(found, settings, diameters[settings.definition], spread, log_sd))
-
-
-def _calibration(found: _Found, settings: EstimatorSettings) -> Calibration:
-    """Of the method; a circle about an upright axis has one of its own."""
-    is_upright = found.method == "circle" and settings.axis == "vertical"
-    return CALIBRATIONS["circle, upright" if is_upright else found.method]
-
-
-def _refusal(
-    found: _Found, settings: EstimatorSettings, chosen: Diameter, spread: Spread, log_sd: float
-) -> Refusal | None:
-    """Why a result may not be given; None where it may."""
-    if found.evidence.is_heap(is_askew=found.method == "circle" and settings.axis == "vertical"):
-        return no_surface(settings)
-    if found.signs is not None and found.signs.chance > settings.max_clutter:
-        return clutter(found.signs, settings)
-    if any(each.may_be_meant for each in found.others):
-        return two_rings(found.tube, found.others, settings)
-    if spread.depth_noise > settings.max_depth_noise:
-        return too_shallow(found.evidence, spread.sigma_m)
-    if not settings.min_diameter_cm <= chosen.value_cm <= settings.max_diameter_cm:
-        return implausible(chosen, settings)
-    is_wide = HALF_90 * log_sd > settings.max_half_width
-    if is_wide or found.evidence.arc_deg < settings.min_arc_deg:
-        return too_uncertain(found.evidence, chosen, settings)
-    return None
-
-
-def _result(
-    found: _Found,
-    origin: Float64,
-    settings: EstimatorSettings,
-    diameters: dict[str, Diameter],
-    spread: Spread,
-    log_sd: float,
-) -> EstimatorResult:
-    tube, evidence = found.tube, found.evidence
-    u, v, w = tube.frame()
-    lean = float(np.degrees(np.arctan(np.hypot(*tube.slope))))
-    position = origin + np.array([*tube.centre, 0.0])
-    angle = np.arange(N_OUTLINE) * (2 * np.pi / N_OUTLINE)
-    radius = tube.radius + tube.waves @ wave_basis(np.cos(angle), np.sin(angle), 1 + len(tube.waves) // 2)
-    flags = flags_of(
-        evidence,
-        tube,
-        lean_deg=lean,
-        beside=found.others,
-        drift_chance=_calibration(found, settings).drift_chance(spread),
-        signs=found.signs,
-    )
-    if found.method != settings.method:
-        words = "the closed curve had no hold, or reached round two stems: a plain circle was fitted"
-        flags = (*flags, Flag("fallback", words))
-    return EstimatorResult(
-        diameters=diameters,
-        definition=settings.definition,
-        method=found.method,
-        arc_deg=evidence.arc_deg,
-        gap_deg=evidence.gap_deg,
-        residual_mm=1000.0 * evidence.residual_m,
-        n_points=evidence.n_points,
-        lean_deg=lean,
-        taper_cm_per_m=200.0 * tube.taper,
-        height_m=settings.breast_height_m,
-        position_m=readonly(position),
-        stem_from_section=Similarity(np.column_stack([u, v, w]), position),
-        outline_uv_m=readonly(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)),
-        outline_sd_m=readonly(found.posterior.outline_sd_m),
-        outline_seen=readonly(evidence.seen),
-        spread=spread,
-        log_sd=log_sd,
-        flags=flags,
-        rings=_rings(found, origin),
-    )
-
-
-def _rings(found: _Found, origin: Float64) -> tuple[SectionRing, ...]:
-    """The stem measured, and those beside it."""
-    tubes = [(found.tube, found.evidence.n_points), *((each.tube, each.n_points) for each in found.others)]
-    return tuple(
-        SectionRing(readonly(origin[:2] + tube.centre), float(tube.radius), n_points) for tube, n_points in tubes
-    )
-
-
-def _spread(logs: tuple[float, float, float], found: _Found) -> Spread:
-    evidence = found.evidence
-    return Spread(
-        posterior=(logs[2] - logs[0]) / 3.29,
-        sigma_m=found.tube.sigma,
-        outline_m=float(found.posterior.outline_sd_m.mean()),
-        scatter_m=found.patches.scatter_m,
-        n_points=evidence.n_points,
-        gap=evidence.gap_deg / 360.0,
-        waves=oval_of(found.tube),
-        wall_ratio=evidence.wall_ratio,
-        diameter_m=float(np.exp(logs[1])),
-        passes=0.0 if found.passes is None else found.passes.probability,
-        apart=0.0 if found.passes is None else found.passes.separation_m / float(np.exp(logs[1])),
-        # A circle is of the points just there, and follows a swelling.
-        bulge=bulge_share(evidence, found.tube) if found.method == "ring" else 0.0,
-    )
-
-
-def _diameter(log_m: float, calibration: Calibration, spread: Spread, told: _Told) -> Diameter:
-    half = HALF_90 * calibration.log_sd(spread, scale_sd=told.scale_sd, drift_m=told.drift_m)
-    return Diameter(
-        100.0 * float(np.exp(log_m)), 100.0 * float(np.exp(log_m - half)), 100.0 * float(np.exp(log_m + half))
-    )
-
-
-def _moved_to(logs: tuple[float, float, float], middle: float) -> tuple[float, float, float]:
-    shift = middle - logs[1]
-    return logs[0] + shift, logs[1] + shift, logs[2] + shift
