@@ -20,6 +20,8 @@ from dbh_studio.ui.bind import TabWorker
 from dbh_studio.ui.server import StudioServer, start_server
 from dbh_studio.ui.studio import Studio
 
+_running: list[Any] = []  # the browser, once a test has asked for it
+
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[StudioServer]:
@@ -66,4 +68,15 @@ def measured(studio: Studio, tmp_path: Path) -> Iterator[FakeClient]:
 def chromium(chromium_path: str) -> Iterator[Any]:
     """One browser for all files; pages have profiles of their own."""
     with browser.chromium(chromium_path) as running:
+        _running.append(running)
         yield running
+        _running.clear()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_page_stays_open() -> Iterator[None]:
+    """A page left open goes on drawing in software, on a core of its own, until all tests of the folder are through."""
+    yield
+    for running in _running:
+        for context in list(running.contexts):
+            context.close()
