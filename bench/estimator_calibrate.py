@@ -10,7 +10,7 @@ stem tells.
 First a logistic regression of "passes do not fit together", on stems of which half the ring or more was seen. Then
 quantile regression of ln |error| on the terms of `Spread`. Every scenario counts alike, and how far the share held in
 it is from nine in ten is added: an interval that is too wide in one place must not pay for one too narrow in another.
-What is printed is what stands in `interval.py`; half of the stems by turns are kept out once to tell what it is worth.
+What is printed goes into `interval.py`; half of the stems by turns are kept out once to tell what it is worth.
 """
 
 from __future__ import annotations

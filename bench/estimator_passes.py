@@ -16,7 +16,7 @@ there. Three logistic regressions follow, in each of which every scenario counts
   passes are the main error, and among two dozen others it would be given up.
 * `_LOOK`, whether to look at all: fitted to whether `_TRUST` would move a stem by more than 0.3 %.
 
-What is printed is what stands in `passes.py`; half of the stems by turns are kept out once to tell what it is worth.
+What is printed goes into `passes.py`; half of the stems by turns are kept out once to tell what it is worth.
 The interval rests on it: `estimator_calibrate.py` is to be run after it.
 """
 

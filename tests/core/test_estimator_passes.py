@@ -145,7 +145,7 @@ class TestPasses:
         assert passes.log_shift(np.log(0.5)) == 0.0
 
     def test_the_shift_is_what_is_trusted_of_the_way_and_never_far(self):
-        passes = Passes(0.2, 0.001, np.zeros(4), 0.02, np.log(0.4), 0.9, 0.5, np.zeros(10))
+        passes = Passes(0.2, np.zeros(4), 0.02, np.log(0.4), 0.9, 0.5, np.zeros(10))
         followed = 0.45 / 0.95  # what is beyond the doubt
         assert passes.log_shift(np.log(0.4) - 0.02) == pytest.approx(0.02 * followed)
         assert passes.log_shift(np.log(0.4) + 1.0) == pytest.approx(-0.12 * followed)

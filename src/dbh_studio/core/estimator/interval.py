@@ -205,4 +205,4 @@ CALIBRATIONS = {
         drift=(-0.3594, 0.4529, 0.0)),
 }
 # fmt: on
-"""By method, and of the circle about an upright axis; printed by `bench/estimator_calibrate.py`."""
+"""By method, and of the circle about an upright axis; from `bench/estimator_calibrate.py`."""

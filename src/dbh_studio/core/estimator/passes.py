@@ -46,7 +46,6 @@ class Passes:
 
     Attributes:
         radius_m: Mean radius at breast height, without the shifts.
-        radius_sd_m: Standard deviation of that.
         waves_m: (4,) a₂, b₂, a₃, b₃ of the outline about it.
         separation_m: Root mean square distance of the passes from their mean, by how many points are of each.
         log_area_m: Logarithm of the diameter of the circle of the same area.
@@ -56,7 +55,6 @@ class Passes:
     """
 
     radius_m: float
-    radius_sd_m: float
     waves_m: Float64
     separation_m: float
     log_area_m: float
@@ -114,7 +112,6 @@ def passes_of(
     radius = max(radius + shift, 0.5 * tube.radius)
     return Passes(
         radius,
-        float(np.sqrt(variance)),
         readonly(waves),
         separation,
         0.5 * float(np.log(4.0 * radius**2 + 2.0 * waves @ waves)),  # waves add half their square to the area's radius
