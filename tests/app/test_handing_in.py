@@ -147,6 +147,42 @@ def test_the_profile_has_every_stem_every_ten_centimetres_and_goes_through_its_d
             assert float(here["dbh_lo_cm"]) < float(row["dbh_cm"]) < float(here["dbh_hi_cm"])
 
 
+def test_the_workbook_has_the_profiles_that_the_csv_has(handed_in):
+    with handed_in["profile"].open(newline="", encoding="utf-8") as file:
+        expected = list(csv.DictReader(file))
+    layers = [name for name, _ in pyogrio.list_layers(handed_in["xlsx"])]
+    assert layers == ["Stems", "Stand", "Stem profiles", "Edits", "About"]
+    meta, _, _, columns = pyogrio.raw.read(handed_in["xlsx"], layer="Stem profiles", HEADERS="FORCE")
+    names = list(meta["fields"])
+    assert names == list(expected[0])
+    assert all(len(column) == len(expected) > 60 for column in columns)
+    for name, column in zip(names, columns, strict=True):
+        texts = [row[name] for row in expected]
+        if name in ("plot_id", "tag", "reason"):
+            assert [cell or "" for cell in column] == texts
+        else:
+            numbers = [float(text) if text else np.nan for text in texts]
+            assert np.asarray(column, float) == pytest.approx(
+                np.array(numbers), abs=0.0501 if "deg" in name else 0.00501, nan_ok=True
+            )
+
+
+def test_a_workbook_without_profiles_looks_along_no_stem(plot, tmp_path, monkeypatch):
+    """It would take minutes in place of seconds."""
+    session, _ = plot
+    monkeypatch.setattr(type(session), "profile", lambda *_, **__: pytest.fail("it looked along a stem"))
+    (path,) = export_plot(session, tmp_path, ExportRequest(("xlsx",)))
+    assert "Stem profiles" not in [name for name, _ in pyogrio.list_layers(path)]
+
+
+def test_every_stem_is_looked_along_once_for_both_files(plot, tmp_path, monkeypatch):
+    session, _ = plot
+    seen = []
+    monkeypatch.setattr(type(session), "profile", lambda self, stem_id, **_: seen.append(stem_id) or ())
+    export_plot(session, tmp_path, ExportRequest(("profile", "xlsx")))
+    assert seen == list(session.document.trunks.ids)
+
+
 def test_every_table_and_map_has_the_same_stems(handed_in):
     rows = inventory_rows(handed_in)
     for kind, layer in (("gpkg", None), ("geojson", None), ("xlsx", "Stems")):

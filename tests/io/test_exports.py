@@ -15,11 +15,14 @@ import pytest
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.dbh import Refusal
 from dbh_studio.core.inventory import Inventory, InventoryRow, MapPosition, TreeRecord, inventory_row
+from dbh_studio.core.measured import Diameter
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.stand import PlotArea, stand_table
+from dbh_studio.core.stem_profile import ProfilePoint
 from dbh_studio.errors import CancelledError, FileError
 from dbh_studio.io.exports import (
     geopackage,
+    profile_table,
     table_of,
     write_dxf,
     write_geojson,
@@ -154,6 +157,20 @@ def test_a_workbook_is_read_by_gdal_and_holds_text_as_text(tmp_path):
     _, _, sums = read(path, layer="Stand", max_features=3)
     assert sums["species"].tolist() == ["oak", "(not said)", "all"]
     assert sums["stems without a diameter"].astype(float).tolist() == [0, 1, 1]
+
+
+def test_profiles_are_in_the_units_asked_for():
+    along = ProfilePoint(1.3, Diameter(25.4, 22.86, None), 180.04, "")
+    nothing = ProfilePoint(2.0, None, None, "only 70° of the ring seen")
+    table = profile_table(stems(), [(7, [along, nothing]), (3, [])], "imperial")
+    assert [column.name for column in table.columns] == [
+        "plot_id", "tree_id", "stem_id", "tag",
+        "height_ft", "dbh_in", "dbh_lo_in", "dbh_hi_in", "coverage_deg", "reason",
+    ]  # fmt: skip
+    first, second = table.rows
+    assert first[:4] == ("plot", 7, 7, "0017")
+    assert first[4:8] == (pytest.approx(1.3 / 0.3048), pytest.approx(10.0), pytest.approx(9.0), None)
+    assert second[5:] == (None, None, None, None, "only 70° of the ring seen")
 
 
 def test_an_empty_inventory_makes_empty_files(tmp_path):

@@ -44,6 +44,17 @@ _PIXEL = """point => {
   return [box.x + (v.x + 1) / 2 * box.width, box.y + (1 - v.y) / 2 * box.height];
 }"""
 
+# What the page has told since it was loaded: a note closes by itself after seconds, in which a busy machine may not
+# have drawn a single frame.
+_REMEMBER_NOTES = """
+window.dbhNotes = [];
+new MutationObserver(changes => changes.forEach(change => change.addedNodes.forEach(added => {
+  if (added.nodeType !== 1) return;
+  const notes = [added, ...added.querySelectorAll('*')].filter(each => each.matches('.mantine-Notification-root'));
+  window.dbhNotes.push(...notes.map(each => each.textContent));
+}))).observe(document, {childList: true, subtree: true});
+"""
+
 
 @contextlib.contextmanager
 def chromium(executable: str) -> Iterator[Any]:
@@ -65,6 +76,7 @@ def open_page(browser: Any, url: str, *, size: tuple[int, int] = (1100, 700), wa
     context = browser.new_context(viewport={"width": size[0], "height": size[1]}, accept_downloads=True)
     page = context.new_page()
     page.set_default_timeout(TIMEOUT_MS)
+    page.add_init_script(_REMEMBER_NOTES)
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -83,6 +95,25 @@ def page_errors(page: Any) -> list[str]:
 def wait_for_points(page: Any, n_points: int) -> None:
     """Wait until a frame with at least so many points was drawn."""
     page.wait_for_function("n => window.__viserTestpoints.rendererInfo.render.points >= n", arg=n_points)
+
+
+def wait_for_frames(page: Any, n_frames: int) -> None:
+    """Wait until the picture was drawn so many times more: what moves in it follows with the next one."""
+    later = """n => new Promise(done => {
+      const next = () => n-- > 0 ? requestAnimationFrame(next) : done();
+      next();
+    })"""
+    page.evaluate(later, n_frames)
+
+
+def unfold(page: Any, title: str) -> None:
+    """Open a folder of the panel, and wait until it has unfolded.
+
+    Until then what is in it moves, also between a press and its release, which is no click then.
+    """
+    page.get_by_text(title, exact=True).first.click()
+    wait_for_frames(page, 3)  # it begins with the second
+    page.wait_for_function("() => !document.getAnimations().some(each => each instanceof CSSTransition)", polling=50)
 
 
 def settle(page: Any, studio: Any) -> None:
@@ -105,6 +136,12 @@ def pixel_of(page: Any, point: Sequence[float]) -> tuple[float, float]:
     """Where a world point is on the page, in CSS pixels."""
     x, y = page.evaluate(_PIXEL, [float(c) for c in point])
     return float(x), float(y)
+
+
+def wait_for_note(page: Any, text: str) -> None:
+    """Wait until a note with this text was shown, since the page was loaded; it may have gone again."""
+    told = "text => window.dbhNotes.some(note => note.includes(text))"
+    page.wait_for_function(told, arg=text, polling=100)
 
 
 def close_notifications(page: Any) -> None:

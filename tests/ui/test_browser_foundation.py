@@ -137,9 +137,9 @@ def test_the_page_works_behind_the_guard(studio: Studio, chromium: Any) -> None:
 
     # A dropped connection comes back as a new tab with a new bridge.
     studio.seen.clear()
+    page.evaluate("() => { document.querySelector('tr.row').dataset.old = true; }")
     studio.server.viser._websock_server.disconnect_all_clients()
-    page.wait_for_function("() => !document.querySelector('tr.row')", polling=20)
-    page.wait_for_selector("tr.row")
+    page.wait_for_selector("tr.row:not([data-old])")
     page.evaluate("() => window.dbh('script', 'again')")
     assert studio.wait("script") == "again"
     until(page, lambda: [tab.closed for tab in studio.tabs] == [True, False])

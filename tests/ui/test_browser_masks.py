@@ -80,7 +80,7 @@ def test_a_pole_that_masks_call_trunk_is_painted_away(
 
     # The masks are looked at, and used when a person says so.
     page.get_by_text("Trunks by geometry alone").wait_for()
-    page.get_by_text("Bring masks").first.click()
+    browser.unfold(page, "Bring masks")
     fill(page, "Masks in", str(brought))
     press(page, "Look at them")
     page.wait_for_selector(".dbh-masklook img")

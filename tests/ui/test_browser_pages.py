@@ -68,6 +68,7 @@ def test_a_stem_is_clicked_in_the_3d_page(chromium, pages):
     dbh_cm = session.measurement(stem_id).result.dbh_cm
     assert f"{dbh_cm:.1f} cm" in page.locator(f"#card article[data-stem='{stem_id}']").inner_text()
     assert page.locator("#card article:visible").count() == 1
+    browser.wait_for_frames(page, 2)
     picture = np.asarray(Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB")).reshape(-1, 3)
     # The chosen stem is drawn yellow: red and green high, blue low.
     assert ((picture[:, 0] > 180) & (picture[:, 1] > 120) & (picture[:, 2] < 110)).sum() > 200

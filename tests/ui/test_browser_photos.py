@@ -52,9 +52,11 @@ def settled(page: Any, studio: Studio) -> np.ndarray:
     assert studio.wait_idle(LONG_S)
     seen = -1
     while seen != frame(page):
+        # The page asks for the next view when one arrives, so what it asks for is known by the second time.
         browser.settle(page, studio)
         seen = frame(page)
-        page.wait_for_timeout(400)
+        browser.settle(page, studio)
+    page.evaluate("view => document.querySelector(view + ' img').decode()", VIEW)
     shot = page.screenshot(clip=page.locator(VIEW).bounding_box())
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 

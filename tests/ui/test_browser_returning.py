@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import socket
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,61 +9,12 @@ from typing import Any
 import browser
 import plots
 import pytest
+from line import Line
 
 from dbh_studio.ui.server import start_server
 from dbh_studio.ui.studio import Studio
 
 pytestmark = pytest.mark.browser
-
-
-class Line:
-    """A network between page and studio that can be cut."""
-
-    def __init__(self) -> None:
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.port = int(self._listening.getsockname()[1])
-        self.target = 0
-        self._is_cut = False
-        self._ends: list[socket.socket] = []
-        self._thread = threading.Thread(target=self._accept, daemon=True)
-        self._thread.start()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                near, _ = self._listening.accept()
-                if self._is_cut:
-                    near.close()
-                    continue
-                far = socket.create_connection(("127.0.0.1", self.target))
-                self._ends += [near, far]
-                for source, target in ((near, far), (far, near)):
-                    threading.Thread(target=self._pass_on, args=(source, target), daemon=True).start()
-
-    @staticmethod
-    def _pass_on(source: socket.socket, target: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while content := source.recv(1 << 16):
-                target.sendall(content)
-            target.shutdown(socket.SHUT_WR)
-
-    def cut(self) -> None:
-        self._is_cut = True
-        for end in self._ends:
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-            end.close()
-        self._ends.clear()
-
-    def mend(self) -> None:
-        self._is_cut = False
-
-    def close(self) -> None:
-        self.cut()
-        with contextlib.suppress(OSError):
-            self._listening.shutdown(socket.SHUT_RDWR)
-        self._listening.close()
-        self._thread.join()
 
 
 @pytest.fixture
@@ -89,17 +37,17 @@ def test_a_page_whose_connection_is_cut_says_so_and_has_its_place_again(
         page.locator(f"tr[data-id='{trunk_id}']").click()
         page.wait_for_selector(f".dbh-card[data-tree='{trunk_id}']")
         page.wait_for_function("() => Boolean(window.dbhWatch)")
+        browser.settle(page, studio)  # the studio knows the page's name
         line.cut()
         page.wait_for_selector("#dbh-lost")
         assert "All that was done is saved" in page.locator("#dbh-lost").inner_text()
         line.mend()
         page.wait_for_selector("#dbh-lost", state="detached")
-        page.get_by_text("Nothing has changed meanwhile.").wait_for()
+        browser.wait_for_note(page, "Nothing has changed meanwhile.")
         page.wait_for_selector(f".dbh-card[data-tree='{trunk_id}']")
-        browser.close_notifications(page)
         # A reload is a page that comes back, too.
         page.reload()
-        page.get_by_text("Nothing has changed meanwhile.").wait_for()
+        browser.wait_for_note(page, "Nothing has changed meanwhile.")
         page.wait_for_selector(f".dbh-card[data-tree='{trunk_id}']")
         # What the browser says itself of a connection that was cut is no error of the page.
         assert [error for error in browser.page_errors(page) if "WebSocket" not in error and "ERR_" not in error] == []

@@ -65,10 +65,6 @@ def press(page: Any, studio: Studio, key: str) -> None:
     browser.settle(page, studio)
 
 
-def open_folder(page: Any, title: str) -> None:
-    page.get_by_text(title, exact=True).click()
-
-
 def field(page: Any, label: str) -> Any:
     """An input of the panel by the label in front of it."""
     return page.locator(
@@ -121,7 +117,7 @@ def test_three_trees_are_looked_through_one_corrected_two_named_and_a_reload_kee
     page.wait_for_selector(f".dbh-card[data-tree='{ids[0]}']")
     was = session.measurement(ids[0]).result
     assert isinstance(was, DbhEstimate)
-    open_folder(page, "Correct this measurement")
+    browser.unfold(page, "Correct this measurement")
     correction = next(iter(studio._tabs.values())).inspect.correction
     field(page, "Why").fill("whorl")
     until(lambda: correction._why.value == "whorl")
@@ -151,7 +147,7 @@ def test_three_trees_are_looked_through_one_corrected_two_named_and_a_reload_kee
     page.click(f".dbh-trees tr[data-id='{ids[3]}']")
     page.wait_for_selector(f".dbh-card[data-tree='{ids[3]}']")
     page.click(f".dbh-trees tr[data-id='{ids[4]}']", modifiers=["Control"])
-    open_folder(page, "About this tree")
+    browser.unfold(page, "About this tree")
     page.wait_for_selector("[data-several='2']")
     field(page, "Species").press_sequentially("fausy", delay=40)
     page.click("button[data-offer='Fagus sylvatica']")

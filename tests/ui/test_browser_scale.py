@@ -158,16 +158,16 @@ def test_the_chosen_point_is_dragged_by_its_arrows(studio: Studio, session: Sess
     marking, camera = tab_of(studio).marking, tab_of(studio).client.camera
     before, eye = np.array(marking.picks.picks[0].point.xyz_src), np.asarray(camera.position)
     browser.settle(page, studio)
-    time.sleep(0.5)  # the page draws the arrows
+    browser.wait_for_frames(page, 3)  # the page draws the arrows
     reach = 0.08 * float(np.linalg.norm(eye - before))
     start = browser.pixel_of(page, before + [0.7 * reach, 0.0, 0.0])
     end = browser.pixel_of(page, before + [1.7 * reach, 0.0, 0.0])
     page.mouse.move(*start)
-    time.sleep(0.5)
+    browser.wait_for_frames(page, 3)  # they know that the pointer is over them
     page.mouse.down()
     for share in np.linspace(0.1, 1.0, 10):
         page.mouse.move(*(np.array(start) + share * (np.array(end) - start)))
-        time.sleep(0.05)
+        browser.wait_for_frames(page, 1)
     page.mouse.up()
     until(lambda: not np.array_equal(marking.picks.picks[0].point.xyz_src, before))
     step = np.array(marking.picks.picks[0].point.xyz_src) - before
@@ -217,10 +217,8 @@ def click_in_photo(page: Any, studio: Studio, tab: Any, point: np.ndarray) -> No
     name = tab.photos.image
     u, v = scale_plots.plot().posed.by_name(name).project(point[None])[0][0]
     tab.worker.post(lambda: tab.photos.open(name, at_px=(float(u), float(v)), zoom_px=4.0))
-    look = until(lambda: drawn_look(tab, (float(u), float(v))))
-    page.wait_for_selector("#dbh-photo .view[data-frame]")
+    look = until(lambda: shown_look(page, tab, (float(u), float(v))))
     browser.settle(page, studio)
-    time.sleep(0.4)  # the page shows the newest picture
     (x, y), _ = (np.asarray(part)[0] for part in look.view_from_photo([[u, v]]))
     left, top, width, height = page.evaluate(_PHOTO_PIXEL)
     n_sights = len(tab.marking.picks.current.sights)
@@ -228,10 +226,11 @@ def click_in_photo(page: Any, studio: Studio, tab: Any, point: np.ndarray) -> No
     until(lambda: len(tab.marking.picks.current.sights) == n_sights + 1)
 
 
-def drawn_look(tab: Any, uv: tuple[float, float]) -> Any:
-    """The look at the photo once it has turned to a pixel."""
-    look = tab.photos._look
-    if look is None:
+def shown_look(page: Any, tab: Any, uv: tuple[float, float]) -> Any:
+    """The look at the photo that the page shows, once it has turned to a pixel; a click is read in that very one."""
+    number = page.evaluate("() => Number(document.querySelector('#dbh-photo .view')?.dataset.frame || 0)")
+    name, look = tab.photos._frames.get(number, (None, None))
+    if look is None or name != tab.photos.image:
         return None
     place, is_inside = look.view_from_photo([uv])
     middle = np.array([look.width_px, look.height_px]) / 2

@@ -35,7 +35,7 @@ def test_from_the_legend_to_the_setting_that_brings_a_tree_back(studio, chromium
     # Neither the bar nor the legend lies over the other, and both are in the window.
     legend, bar = (page.locator(name).bounding_box() for name in ("#dbh-chain", "#dbh-view"))
     assert legend["y"] >= 0 and legend["y"] + legend["height"] <= bar["y"]
-    page.get_by_text("Where trees were lost").click()
+    browser.unfold(page, "Where trees were lost")
     page.locator("[data-go]").first.click()
     page.wait_for_selector(".dbh-story")
     page.locator(".dbh-story [data-try]").first.click()

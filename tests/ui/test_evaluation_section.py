@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import csv
+import html
 import re
+from decimal import ROUND_HALF_UP, Decimal
 
 import browser
+import endless
+import numpy as np
 import plots
 import pytest
 from fakeclient import FakeClient
-from panel import LONG
+from panel import LONG, idle
 
-from dbh_studio.app import commands
+from dbh_studio.app import commands, pipeline
+from dbh_studio.app.evaluation import EvaluationRequest, evaluate_files, evaluate_plot, report_files
+from dbh_studio.core.comparison import Grouping
+from dbh_studio.io.evaluation_report import rounded
+from dbh_studio.ui.evaluation_section import lines_table, misfits, summary
 
 
 @pytest.fixture
@@ -52,9 +61,9 @@ def test_bias_scatter_and_the_trees_without_a_pair(measured, field):
     assert bias
     assert abs(float(bias[1])) < 1.5
     # Every tree is a point that names itself.
-    html = measured.html()
-    assert sorted(map(int, re.findall(r'data-tree="(\d+)" style', html))) == sorted(table_ids_of(measured))
-    assert "<title>tree T" in html
+    shown = measured.html()
+    assert sorted(map(int, re.findall(r'data-tree="(\d+)" style', shown))) == sorted(table_ids_of(measured))
+    assert "<title>tree T" in shown
 
 
 def table_ids_of(tab: FakeClient) -> list[int]:
@@ -179,7 +188,7 @@ def test_in_the_page_a_point_is_pressed_and_the_tree_is_chosen(studio, field, tm
     studio.adopt(plots.measured_session(tmp_path))
     page = browser.open_page(chromium, studio.server.url)
     page.locator('button[data-step="export"]').click(timeout=browser.TIMEOUT_MS)
-    page.get_by_text("Compare with field measurements").click(timeout=browser.TIMEOUT_MS)
+    browser.unfold(page, "Compare with field measurements")
     inputs = "ancestor::div[contains(@class,'mantine-Flex-root')][1]//input"
     page.locator(f"//label[normalize-space()='Field table']/{inputs}").first.fill(str(field))
     page.get_by_role("button", name="Compare", exact=True).click()
@@ -205,3 +214,135 @@ def test_field_values_are_kept_beside_the_estimates_and_taken_back(measured, stu
     assert (tape.who, tape.why) == (studio.session.author, "field.csv")
     studio.session.undo()
     assert studio.session.document is document
+
+
+# ---- the same figures everywhere
+
+
+def half_up(text: str, digits: int) -> Decimal:
+    """A number as a person rounds it who sees it written."""
+    return Decimal(text).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP)
+
+
+@pytest.mark.parametrize("digits", [0, 1, 2, 3])
+def test_numbers_are_rounded_as_they_are_written(digits):
+    rng = np.random.default_rng(digits)
+    for _ in range(2000):
+        text = f"{rng.integers(-100_000, 100_000)}.{rng.integers(0, 10_000):04d}"[: rng.integers(6, 12)].rstrip(".")
+        shown = rounded(float(text), digits)
+        assert Decimal(shown) == half_up(text, digits) and not shown.startswith("-0.000")
+    assert [rounded(v, 1) for v in (40.05, -40.05, 40.15, -0.04, 2.25)] == ["40.1", "-40.1", "40.2", "0.0", "2.3"]
+    assert rounded(7, digits) == "7" and rounded(None, digits, nothing="–") == "–"
+    assert float(rounded(1e300, digits)) == 1e300 and rounded(float("nan"), digits) == "nan"
+
+
+def random_tables(folder, rng):
+    """An inventory and a field table with diameters in whole tenths of millimetres, many of which are ties."""
+    n = int(rng.integers(3, 40))
+    reference = np.round(rng.uniform(8, 80, n) * 20) / 20
+    estimated = np.round((reference + rng.normal(0, 1.5, n)) * 20) / 20
+    estimated[rng.random(n) < 0.1] = np.nan
+    rows = [f"{k},{'' if np.isnan(e) else f'{e:.2f}'},{'NS'[k % 2]}" for k, e in enumerate(estimated)]
+    (folder / "mine.csv").write_text("\n".join(["tree,dbh_cm,side", *rows]))
+    (folder / "field.csv").write_text("\n".join(["tree,dbh_cm", *(f"{k},{r:.2f}" for k, r in enumerate(reference))]))
+    return EvaluationRequest(folder / "field.csv", (folder / "mine.csv",), by=(Grouping.parse("inventory:side"),))
+
+
+def cells_of(page: str, row: str) -> list[list[str]]:
+    return [
+        [html.unescape(cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", found)]
+        for found in re.findall(rf"<tr {row}.*?</tr>", page)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_every_figure_of_the_panel_is_that_of_the_report(tmp_path, seed):
+    comparison = evaluate_files(random_tables(tmp_path, np.random.default_rng(seed)))
+    files = report_files(comparison)
+    markdown = [line.strip("| \n").split(" | ") for line in files["table.md"].decode().splitlines()[2:]]
+    exact = list(csv.DictReader(files["table.csv"].decode().splitlines()))
+    panel = cells_of(lines_table(comparison), "data-line=")
+    assert len(panel) == len(markdown) == len(exact) == 3
+    heads = ("median_bias_cm", "mad_cm", "rcv_pct", "r_squared", "median_rel_err_pct", "p90_rel_err_pct", "rmse_cm")
+    for shown, told, numbers in zip(panel, markdown, exact, strict=True):
+        assert shown[1:9] == [*told[2:9], told[10]]
+        for text, head in zip(shown[2:9], heads, strict=True):
+            if text != "–":
+                digits = -int(Decimal(text).as_tuple().exponent)
+                assert abs(Decimal(text) - Decimal(numbers[head])) <= Decimal("0.5005").scaleb(-digits), head
+            else:
+                assert numbers[head] == ""
+    # The summary says what the first line says.
+    said = re.findall(r"[-+]?\d+(?:\.\d+)?", re.sub(r"<[^>]*>|R²", " ", summary(comparison).split("Interval")[0]))
+    for text in markdown[0][3:11]:
+        assert text == "–" or {text, f"+{text}"} & set(said)
+    # And the list of pairs what the file of pairs says.
+    pairs = {row["stem"]: row for row in csv.DictReader(files["pairs.csv"].decode().splitlines())}
+    listed = cells_of(misfits(comparison), "data-pair=")
+    assert listed
+    for stem, _, estimated, reference, error in listed:
+        row = pairs[stem]
+        assert Decimal(estimated) == half_up(row["estimated_cm"], 2)
+        assert Decimal(reference) == half_up(row["reference_cm"], 2)
+        assert abs(Decimal(error) - Decimal(row["error_pct"])) <= Decimal("0.0505")
+
+
+# ---- every method, as a job
+
+
+def test_measuring_by_every_method_can_be_cancelled(measured, studio, field, monkeypatch):
+    compare(measured, field)
+    before = lines_of(measured)
+    with monkeypatch.context() as patch:
+        patch.setattr("dbh_studio.app.pipeline.measure_stems", endless.work)
+        measured.set("Every method", True)
+        measured.wait_text("Measuring by every method", LONG)
+        measured.wait(lambda t: any("Not done yet" in script for script in t.javascript), LONG)
+        # The tab is there meanwhile, and what it showed.
+        measured.wait_text("Median bias")
+        measured.bridge_send("cancel")
+        assert "by the plot's own diameters" in measured.wait_notification("Cancelled", LONG).body
+        measured.wait(lambda t: t.value("Every method") is False)
+        idle(measured, studio)
+    assert lines_of(measured) == before and "Median bias" in measured.text()
+    # Nothing of it is in the way of another try.
+    measured.set("Every method", True)
+    measured.wait(lambda t: len(lines_of(t)) == 5, LONG)
+
+
+def test_methods_are_measured_once_for_every_question(measured, studio, field, monkeypatch):
+    compare(measured, field)
+    measured.set("Every method", True)
+    measured.wait(lambda t: len(lines_of(t)) == 5, LONG)
+    idle(measured, studio)
+    monkeypatch.setattr("dbh_studio.app.pipeline.measure_stems", endless.work)
+    measured.set("Tell apart by", "diameter")
+    measured.wait(lambda t: len(lines_of(t)) > 5, LONG)
+    measured.set("Every method", False)
+    measured.wait(lambda t: len({row[1] for row in lines_of(t)}) > 1 and "bspline" not in t.text(), LONG)
+    measured.set("Every method", True)
+    measured.wait_text("bspline", LONG)
+    assert studio._job is None
+
+
+def test_while_another_job_runs_the_plots_own_diameters_are_compared(measured, studio, field, monkeypatch):
+    monkeypatch.setattr("dbh_studio.app.pipeline.segment_plot", plots.endless_search)
+    open_step(measured)
+    studio.find_trunks()
+    measured.wait_text("Finding trunks")
+    measured.set("Every method", True)
+    measured.set("Field table", str(field))
+    measured.press("Compare")
+    measured.wait_notification("Finding trunks is still running", LONG)
+    measured.wait(lambda t: t.value("Every method") is False and "Median bias" in t.text())
+    studio.cancel_job()
+    idle(measured, studio)
+
+
+def test_a_job_compares_what_is_compared_without_one(measured, studio, field):
+    session, request = studio.session, EvaluationRequest(field, every_method=True)
+    document = session.document
+    compared = pipeline.measure_stems(*pipeline.comparison_call(session, document))
+    beside = evaluate_plot(session, request, compared=compared)
+    alone = evaluate_plot(session, request)
+    assert beside.lines == alone.lines and len(beside.methods) == 5

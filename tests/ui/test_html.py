@@ -136,6 +136,21 @@ def test_the_hint_leads_to_the_step_where_the_next_thing_is_done():
     assert 'data-do="next"' not in there
 
 
+def history_buttons(**options):
+    """State and tooltip of Undo and Redo."""
+    header = html.header("plot", PlotStatus(has_plot=True), "open", saved="", **options)
+    found = re.findall(r'<button type="button" data-do="(?:undo|redo)" title="([^"]*)"[^>]*?( disabled)?>', header)
+    return [("off" if off else "on", tip) for tip, off in found]
+
+
+def test_undo_and_redo_can_be_pressed_where_there_is_something_and_say_why_not_on_a_plot_for_reading():
+    labels = {"undo": "Delete trunk 3", "redo": ""}
+    assert history_buttons(**labels) == [("on", "Undo: Delete trunk 3"), ("off", "")]
+    both = history_buttons(undo="Delete trunk 3", redo="Merge", is_read_only=True)
+    assert [state for state, _ in both] == ["off", "off"]
+    assert all("reading only" in tip and "copy" in tip for _, tip in both)
+
+
 def test_the_hint_gives_its_place_to_a_running_job():
     status = PlotStatus(has_plot=True, is_scaled=True)
     assert "Press Find trunks." not in html.header("plot", status, "trunks", saved="", undo="", redo="", is_busy=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -36,6 +36,7 @@ from dbh_studio.settings import CurveName
 if TYPE_CHECKING:
     from dbh_studio.app.document import Document
     from dbh_studio.app.session import Session
+    from dbh_studio.stages.measure import StemMeasurement
 
 _KIND = "dbh-studio evaluation"
 _RECORD = "evaluation.json"
@@ -106,30 +107,47 @@ def _told_apart(paths: Sequence[Path]) -> list[str]:
     return names
 
 
-def evaluate_plot(session: Session, request: EvaluationRequest) -> Comparison:
-    """Evaluate the open plot as it is measured now.
+def evaluate_plot(
+    session: Session,
+    request: EvaluationRequest,
+    *,
+    document: Document | None = None,
+    compared: Iterable[StemMeasurement] | None = None,
+) -> Comparison:
+    """Evaluate the open plot as it is measured now, or was.
+
+    Args:
+        session: The plot.
+        request: What to compare it with.
+        document: Another state of it than that of now.
+        compared: For `EvaluationRequest.every_method`: the stems of that state with every method's curve, as a job
+            measured them (`pipeline.comparison_call`). None to measure them here, which takes long.
 
     Raises:
         FileError: The reference cannot be read or understood.
         StudioError: They cannot be paired.
     """
-    document = session.document
+    document = document or session.document
     # Without fields of one's own: they may be called as anything that is looked for in a table.
     content = inventory_csv(replace(session.inventory(document=document), own=()))
     table = stem_table_of(content, request.inventory_reading, name=document.plot_id or "this plot")
-    return _compared([_with_methods(session, document, table) if request.every_method else table], request)
+    if request.every_method:
+        if compared is None:
+            compared = (session.compared(i, document=document) for i in document.trunks.ids)
+        table = _with_methods(table, document.settings.measure.curve, compared)
+    return _compared([table], request)
 
 
-def _with_methods(session: Session, document: Document, table: StemTable) -> StemTable:
+def _with_methods(table: StemTable, curve: CurveName, compared: Iterable[StemMeasurement]) -> StemTable:
     """The table with the diameters by every other method; a stem that is refused has none by any."""
     from dbh_studio.core.measured import CurveFit, DbhEstimate
 
-    n = len(table)
+    n, row_of = len(table), {int(number): row for row, number in enumerate(table.cells["stem_id"])}
     # Value and ends of the interval.
     given: dict[str, Float64] = {name: np.full((n, 3), np.nan) for name in get_args(CurveName)}
-    for row, number in enumerate(table.cells["stem_id"]):
-        result = session.compared(int(number), document=document).result
-        if not isinstance(result, DbhEstimate):
+    for stem in compared:
+        result, row = stem.result, row_of.get(stem.trunk_id)
+        if row is None or not isinstance(result, DbhEstimate):
             continue
         for name, fit in result.fits.items():
             if isinstance(fit, CurveFit) and name in given:
@@ -137,7 +155,7 @@ def _with_methods(session: Session, document: Document, table: StemTable) -> Ste
                 given[name][row] = [
                     np.nan if v is None else v for v in (diameter.value_cm, diameter.low_cm, diameter.high_cm)
                 ]
-    main, curve = table.methods[0], document.settings.measure.curve
+    main = table.methods[0]
     # What was chosen of single trees, or drawn by hand, is no other method's.
     is_plain = set(table.cells["dbh_method"]) <= {"", curve}
     first = curve if is_plain else AS_MEASURED

@@ -55,7 +55,8 @@ TITLES: dict[Format, str] = {
     "report": "report to read and print, one HTML file",
     "pdf": "the report as PDF, printed by a Chromium or Chrome of this computer",
     "3d": "the plot to look at in 3D, one HTML file",
-    "profile": "diameters along each stem, every 10 cm with their intervals, as CSV; takes a while",
+    "profile": "diameters along each stem, every 10 cm with their intervals, as CSV and, with xlsx, as a sheet of it; "
+    "takes a while",
     "edits": "who changed what and when, as CSV",
     "svg": "stem map to look at and print",
     "dxf": "stem map for CAD",
@@ -204,6 +205,7 @@ class _Writer:
         self.area = area
         self.table = table_of(inventory, request.units)
         self._report: Report | None = None
+        self._seen_along: dict[int, tuple[ProfilePoint, ...]] = {}
 
     def write(self, kind: Format, path: Path, progress: Progress) -> None:
         """Write one file."""
@@ -217,7 +219,10 @@ class _Writer:
         elif kind == "geojson":
             exports.write_geojson(path, self.table)
         elif kind == "xlsx":
-            exports.write_xlsx(path, self.table, self.stand, about=self._about(), log=self.log)
+            profiles = None
+            if "profile" in self.request.formats:  # Else a table of seconds would take minutes.
+                profiles = exports.profile_table(self.inventory, self._profiles(progress), self.request.units)
+            exports.write_xlsx(path, self.table, self.stand, about=self._about(), log=self.log, profiles=profiles)
         elif kind == "svg":
             exports.write_svg(path, self.table, area=self.area, north=north_of(self.session, self.document))
         elif kind == "dxf":
@@ -250,10 +255,13 @@ class _Writer:
             write_report_pdf(path, exports.report_html(self._report))
 
     def _profiles(self, progress: Progress) -> Iterator[tuple[int, tuple[ProfilePoint, ...]]]:
+        """By number of the stem; what one file looked at is there for the next."""
         ids = [row.stem_id for row in self.inventory]
         for number, stem_id in enumerate(ids):
-            progress(number / len(ids), f"Looking along stem {stem_id}")
-            yield stem_id, self.session.profile(stem_id, document=self.document)
+            if stem_id not in self._seen_along:
+                progress(number / len(ids), f"Looking along stem {stem_id}")
+                self._seen_along[stem_id] = self.session.profile(stem_id, document=self.document)
+            yield stem_id, self._seen_along[stem_id]
 
     def _write_cloud(self, path: Path, progress: Progress) -> None:
         from dbh_studio.io import exports

@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from dbh_studio.core.trunks import Trunk, TrunkSet
 from dbh_studio.errors import CommandError, ProjectError, ProjectExistsError
 from dbh_studio.io.inventory_csv import check_absent, check_not_source, check_replaceable, write_inventory_csv
 from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, is_project
-from dbh_studio.settings import GroundSettings, Settings
+from dbh_studio.settings import CurveName, GroundSettings, Settings
 
 if TYPE_CHECKING:
     from dbh_studio.app.brought_masks import MaskSet, VotingMasks
@@ -49,6 +49,7 @@ __all__ = [
     "RunResult",
     "Segmentation",
     "apply_segmentation",
+    "comparison_call",
     "measure_stems",
     "measurement_call",
     "open_plot",
@@ -220,10 +221,14 @@ def measure_stems(
     stems: Sequence[tuple[int, Float32, StemSetup]],
     ground: GroundModel,
     scale_sd: float = 0.0,
+    curves: Sequence[str] | None = None,
     *,
     progress: Progress = ignore_progress,
 ) -> list[StemMeasurement]:
-    """Measure many stems, given as (id, (K, 3) points_world, how). Pure and picklable, for a job."""
+    """Measure many stems, given as (id, (K, 3) points_world, how). Pure and picklable, for a job.
+
+    `curves` are fitted beside the chosen one.
+    """
     from dbh_studio.stages.measure import measure_trunk
 
     def measure(stem: tuple[int, Float32, StemSetup]) -> StemMeasurement:
@@ -234,6 +239,7 @@ def measure_stems(
             ground=ground,
             settings=setup.settings,
             scale_sd=scale_sd,
+            curves=curves,
             **setup.placed,
         )
 
@@ -264,9 +270,18 @@ def measurement_call(session: Session, document: Document) -> tuple[Any, ...]:
 
     Give the result to ``session.remember_measurements(document, result)``; it is right whatever happened meanwhile.
     """
+    return _stems_call(session, document, session.unmeasured(document))
+
+
+def comparison_call(session: Session, document: Document) -> tuple[Any, ...]:
+    """The arguments of `measure_stems` for all stems of a state, with every other method beside the chosen one."""
+    return *_stems_call(session, document, document.trunks.ids), get_args(CurveName)
+
+
+def _stems_call(session: Session, document: Document, ids: Sequence[int]) -> tuple[Any, ...]:
     points_world = session.points_world(document)
     trunks = document.trunks
-    stems = [(i, points_world[trunks[i].points], stem_setup_of(document, i)) for i in session.unmeasured(document)]
+    stems = [(i, points_world[trunks[i].points], stem_setup_of(document, i)) for i in ids]
     return stems, session.ground(document=document), document.scale.relative_sd
 
 

@@ -6,9 +6,10 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from decimal import ROUND_HALF_UP, Decimal
 from typing import Any
 
-from dbh_studio.core.evaluation import ALL, MIN_N, MIN_N_R2, MIN_N_TAIL, Line, Sample
+from dbh_studio.core.evaluation import ALL, MIN_N, MIN_N_R2, MIN_N_TAIL, Line, Sample, Statistics
 from dbh_studio.io.inventory_csv import defused
 
 TABLE_COLUMNS = (
@@ -21,6 +22,14 @@ PAIR_COLUMNS = (
     "lo_cm", "hi_cm", "distance_m", "next_m", "reason",
 )  # fmt: skip
 _STATISTICS = TABLE_COLUMNS[9:]
+# Decimals of what a person reads, on paper and in the studio; the CSV has more.
+_SHOWN_DECIMALS = {
+    "median_bias_cm": 2, "mad_cm": 2, "rcv_pct": 2, "r_squared": 2, "median_rel_err_pct": 1, "p90_rel_err_pct": 1,
+    "mean_bias_cm": 2, "rmse_cm": 2, "estimated_cm": 2, "reference_cm": 2, "error_cm": 2, "error_pct": 1,
+}  # fmt: skip
+_DECIMAL_UP_TO = 1e15
+_PAPERS_STATISTICS = ("median_bias_cm", "mad_cm", "rcv_pct", "r_squared")
+_MARKDOWN_STATISTICS = (*_PAPERS_STATISTICS, "median_rel_err_pct", "p90_rel_err_pct", "mean_bias_cm", "rmse_cm")
 _ORDER = ("measured", "refused", "missed", "extra", "unknown", "outside")
 
 
@@ -50,13 +59,33 @@ def _numbers(line: Line) -> dict[str, str]:
 
 
 def rounded(value: float | int | None, digits: int, *, nothing: str = "") -> str:
-    """A number as text; `nothing` for None, and no minus before a zero."""
+    """A number as text; `nothing` for None, and no minus before a zero.
+
+    Halves go away from zero as on paper, and it is the number as it is written that counts: 40.05, which is read from a
+    table and is a little less in binary, is 40.1 with one decimal.
+    """
     if value is None:
         return nothing
     if isinstance(value, int):
         return str(value)
-    text = f"{value:.{digits}f}"
+    if not abs(value) < _DECIMAL_UP_TO:
+        return f"{value:.{digits}f}"
+    text = f"{Decimal(repr(float(value))).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP):f}"
     return text.removeprefix("-") if float(text) == 0 else text
+
+
+def shown(values: Statistics | Sample, name: str, *, nothing: str = "–", with_sign: bool = False) -> str:
+    """One of `values` as it is shown to a person: the same text in every table, in the studio and in a report.
+
+    Args:
+        values: Of a line, or of a pair.
+        name: Which of them: a column of `TABLE_COLUMNS` or `PAIR_COLUMNS`.
+        nothing: For what is not known.
+        with_sign: A plus before what is more than zero.
+    """
+    value = getattr(values, name)
+    text = rounded(value, _SHOWN_DECIMALS[name], nothing=nothing)
+    return f"+{text}" if with_sign and value is not None and value > 0 and float(text) != 0 else text
 
 
 def pairs_csv(samples: Sequence[Sample], columns: Sequence[str] = ()) -> bytes:
@@ -103,9 +132,7 @@ def table_markdown(lines: Sequence[Line]) -> str:
             markdown_text(data_name(line)),
             markdown_text(line.method),
             str(s.n),
-            *(rounded(v, 2, nothing="–") for v in (s.median_bias_cm, s.mad_cm, s.rcv_pct, s.r_squared)),
-            *(rounded(v, 1, nothing="–") for v in (s.median_rel_err_pct, s.p90_rel_err_pct)),
-            *(rounded(v, 2, nothing="–") for v in (s.mean_bias_cm, s.rmse_cm)),
+            *(shown(s, name) for name in _MARKDOWN_STATISTICS),
             f"{found} of {line.n_reference}" if line.n_reference else "–",
             str(line.n_refused),
             rounded(line.n_extra, 0, nothing="–"),
@@ -161,8 +188,7 @@ def table_latex(lines: Sequence[Line]) -> str:
         for row, line in enumerate(members):
             first = name if len(members) == 1 else rf"\multirow{{{len(members)}}}{{*}}{{{name}}}"
             s = line.statistics
-            numbers = (s.median_bias_cm, s.mad_cm, s.rcv_pct, s.r_squared)
-            cells = [latex_text(line.method), str(s.n), *(rounded(v, 2, nothing="--") for v in numbers)]
+            cells = [latex_text(line.method), str(s.n), *(shown(s, name, nothing="--") for name in _PAPERS_STATISTICS)]
             body.append(f"{'' if row else first} & {' & '.join(cells)} \\\\")
     return "\n".join(
         [

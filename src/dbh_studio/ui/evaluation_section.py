@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import viser
 
+from dbh_studio.app import pipeline
 from dbh_studio.core.evaluation import ALL, MIN_N, Line, Sample
-from dbh_studio.core.evaluation_figures import sample_title, scatter_svg
+from dbh_studio.core.evaluation_figures import scatter_svg
 from dbh_studio.errors import StudioError
-from dbh_studio.io.evaluation_report import rounded
+from dbh_studio.io.evaluation_report import shown
 from dbh_studio.ui import html
 from dbh_studio.ui.bridge import call, esc
 from dbh_studio.ui.panels.base import set_content, set_value, set_visible, typed_path
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from dbh_studio.app.session import Session
     from dbh_studio.core.comparison import Comparison
     from dbh_studio.core.stem_layout import PairBy
+    from dbh_studio.stages.measure import StemMeasurement
     from dbh_studio.ui.tab import Tab
 
 _PAIR_BY: dict[str, PairBy] = {"as found": "auto", "number": "id", "place": "position"}
@@ -34,6 +36,10 @@ _APART = {
     "ring seen": "inventory:coverage_deg:180,270",
     "diameter": "reference_cm",
 }
+_LINE_STATISTICS = (
+    *("median_bias_cm", "mad_cm", "rcv_pct", "r_squared"),
+    *("median_rel_err_pct", "p90_rel_err_pct", "rmse_cm"),
+)
 _MOST_KINDS = 12
 _WORST_SHOWN = 15
 _OTHERS_SHOWN = 10
@@ -45,6 +51,8 @@ class EvaluationSection:
     def __init__(self, tab: Tab) -> None:
         self.tab = tab
         self._done: tuple[Session, Document, EvaluationRequest, Comparison] | None = None
+        # What was measured last by every method, and of which state of the plot.
+        self._by_methods: tuple[Document, Sequence[StemMeasurement]] | None = None
         self._shown_for: Session | None = None
         self._offered = dict(_APART)
         gui, worker = tab.client.gui, tab.worker
@@ -93,7 +101,7 @@ class EvaluationSection:
         session = self.tab.session
         set_visible(self._folder, session is not None and len(session.document.trunks) > 0)
         if session is not self._shown_for:  # of another plot: its report must not be written over
-            self._shown_for, self._done = session, None
+            self._shown_for, self._done, self._by_methods = session, None, None
             for field in (self._path, self._out):
                 set_value(field, "")
             self._offer(_APART)
@@ -115,27 +123,70 @@ class EvaluationSection:
         set_content(self._worst, misfits(comparison))
 
     def _compare(self) -> None:
+        """Compare the plot as it is; by every method once a job has measured it so, and until then by its own."""
+        session = self.tab.require_session()
+        document = session.document
+        self._compare_state(session, document)
+        if self._methods.value and self._methods_of(document) is None:
+            self._start_measuring(session, document)
+
+    def _methods_of(self, document: Document) -> Sequence[StemMeasurement] | None:
+        known = self._by_methods
+        return known[1] if known is not None and known[0] is document else None
+
+    def _start_measuring(self, session: Session, document: Document) -> None:
+        """Measure all stems by every method, in a job that Cancel stops."""
+        worker = self.tab.worker
+
+        def done(measured: Sequence[StemMeasurement]) -> None:
+            worker.post(self._methods_measured, session, document, measured)
+
+        try:
+            self.tab.studio.start_job(
+                "Measuring by every method",
+                pipeline.measure_stems,
+                pipeline.comparison_call(session, document),
+                session,
+                done,
+                failed=lambda _: worker.post(self._methods_not_measured),
+                if_stopped="the comparison is by the plot's own diameters.",
+            )
+        except StudioError:
+            self._methods_not_measured()
+            raise
+
+    def _methods_measured(self, session: Session, document: Document, measured: Sequence[StemMeasurement]) -> None:
+        if session is not self.tab.session:
+            return
+        self._by_methods = document, measured
+        if self._methods.value and self._done is not None:
+            self._compare_state(session, document)
+
+    def _methods_not_measured(self) -> None:
+        """What is ticked is what is on screen."""
+        set_value(self._methods, False)
+
+    def _compare_state(self, session: Session, document: Document) -> None:
         # Here, not above: scipy takes a second to import, and most sessions compare nothing.
         from dbh_studio.app.evaluation import EvaluationRequest, evaluate_plot
         from dbh_studio.core.comparison import Grouping
         from dbh_studio.core.stem_layout import PairingRule
 
-        session = self.tab.require_session()
         path = typed_path(self._path.value)
         if path is None:
             raise StudioError("No table was named.", "Type the path of a table with diameters measured in the field.")
-        document = session.document
         _check_measured(session, document)
+        compared = self._methods_of(document)
         apart = self._offered.get(self._apart.value, "")
         request = EvaluationRequest(
             path,
             by=(Grouping.parse(apart),) if apart else (),
             rule=PairingRule(_PAIR_BY[self._by.value]),
-            every_method=self._methods.value,
+            every_method=self._methods.value and compared is not None,
         )
         self._done = None  # what is on screen must not pass for the answer while this one fails
         try:
-            comparison = evaluate_plot(session, request)
+            comparison = evaluate_plot(session, request, document=document, compared=compared)
             self._done = session, document, request, comparison
             self._offer(_APART | columns_to_tell_apart(comparison))
             if not self._out.value:
@@ -219,16 +270,16 @@ def summary(comparison: Comparison) -> str:
     pairs = [("Trees with both diameters", str(s.n))]
     if s.median_bias_cm is not None and s.mean_bias_cm is not None and s.rmse_cm is not None:
         pairs += [
-            ("Median bias", f"{s.median_bias_cm:+.2f} cm"),
-            ("Mean bias", f"{s.mean_bias_cm:+.2f} cm"),
-            ("RMSE", f"{s.rmse_cm:.2f} cm"),
-            ("MAD, rCV", f"{s.mad_cm:.2f} cm, {s.rcv_pct:.1f} %"),
-            ("Median relative error", f"{s.median_rel_err_pct:.1f} %"),
+            ("Median bias", f"{shown(s, 'median_bias_cm', with_sign=True)} cm"),
+            ("Mean bias", f"{shown(s, 'mean_bias_cm', with_sign=True)} cm"),
+            ("RMSE", f"{shown(s, 'rmse_cm')} cm"),
+            ("MAD, rCV", f"{shown(s, 'mad_cm')} cm, {shown(s, 'rcv_pct')} %"),
+            ("Median relative error", f"{shown(s, 'median_rel_err_pct')} %"),
         ]
     if s.p90_rel_err_pct is not None:
-        pairs.append(("9 of 10 are within", f"{s.p90_rel_err_pct:.1f} %"))
+        pairs.append(("9 of 10 are within", f"{shown(s, 'p90_rel_err_pct')} %"))
     if s.r_squared is not None:
-        pairs.append(("R²", f"{s.r_squared:.3f}"))
+        pairs.append(("R²", shown(s, "r_squared")))
     if s.n_intervals:
         pairs.append(("Interval holds the field value", f"{s.n_covered} of {s.n_intervals}"))
     n_found = line.n_measured + line.n_refused
@@ -266,11 +317,7 @@ def lines_table(comparison: Comparison) -> str:
         s = line.statistics
         cells = [
             str(s.n),
-            *(rounded(v, 2, nothing="–") for v in (s.median_bias_cm, s.mad_cm)),
-            rounded(s.rcv_pct, 1, nothing="–"),
-            rounded(s.r_squared, 2, nothing="–"),
-            *(rounded(v, 1, nothing="–") for v in (s.median_rel_err_pct, s.p90_rel_err_pct)),
-            rounded(s.rmse_cm, 2, nothing="–"),
+            *(shown(s, name) for name in _LINE_STATISTICS),
             str(line.n_refused),
             f"{s.n_covered}/{s.n_intervals}" if s.n_intervals else "–",
         ]
@@ -330,16 +377,16 @@ def misfits(comparison: Comparison) -> str:
 
 def _row(sample: Sample, number: int | None) -> str:
     click = f' onclick="{call("row", number)}"' if number is not None else ""
-    shown = (
+    texts = (
         str(number) if number is not None else sample.stem,
         sample.tree,
-        f"{sample.estimated_cm:.1f}",
-        f"{sample.reference_cm:.1f}",
-        f"{sample.error_pct:+.1f}",
+        shown(sample, "estimated_cm"),
+        shown(sample, "reference_cm"),
+        shown(sample, "error_pct", with_sign=True),
     )
-    cells = "".join(f"<td>{esc(text)}</td>" for text in shown)
-    tip = esc(sample_title(replace(sample, plot="")))
-    return f'<tr data-pair="{esc(shown[0])}" title="{tip}"{click}>{cells}</tr>'
+    cells = "".join(f"<td>{esc(text)}</td>" for text in texts)
+    tip = f"off by {shown(sample, 'error_cm', with_sign=True)} cm"
+    return f'<tr data-pair="{esc(texts[0])}" title="{esc(tip)}"{click}>{cells}</tr>'
 
 
 def _numbers(comparison: Comparison) -> dict[str, int]:

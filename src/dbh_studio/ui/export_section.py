@@ -36,7 +36,7 @@ _LABELS: dict[Format, str] = {
     "report": "Report (HTML)",
     "pdf": "Report (PDF)",
     "3d": "3D page (HTML)",
-    "profile": "Stem profiles (CSV)",
+    "profile": "Stem profiles (CSV, Excel)",
     "edits": "Edit log (CSV)",
     "svg": "Stem map (SVG)",
     "dxf": "Stem map (DXF)",

@@ -37,6 +37,7 @@ def header(
     redo: str,
     problem: str = "",
     is_busy: bool = False,
+    is_read_only: bool = False,
 ) -> str:
     """Plot name, where it is saved, Undo and Redo, the five steps, and the sentence that says what to do now.
 
@@ -49,8 +50,10 @@ def header(
         redo: What Redo would do again; empty where nothing.
         problem: Why it is not saved; in red, and in full.
         is_busy: A job runs: its box stands where the sentence would, so that nothing jumps.
+        is_read_only: Nothing can be undone or done again, and the two say why.
     """
     done = status.done()
+    locked = _READ_ONLY if is_read_only else ""
     place = f'<div class="muted dbh-saved">{esc(saved)}</div>'
     if problem:
         place = message(f"NOT SAVED. {problem}", level="stop")
@@ -62,11 +65,15 @@ def header(
     )
     return (
         f'<div class="dbh"><div class="dbh-top"><h3 title="{esc(plot_name)}">{esc(plot_name or "No plot open")}</h3>'
-        f"{_history_button('undo', '&#8630; Undo', undo)}{_history_button('redo', '&#8631; Redo', redo)}</div>"
+        f"{_history_button('undo', '&#8630; Undo', undo, locked)}"
+        f"{_history_button('redo', '&#8631; Redo', redo, locked)}</div>"
         f"{place}"
         f'<div class="dbh-steps">{buttons}</div>'
         f"{'' if is_busy else _hint(status, active)}</div>"
     )
+
+
+_READ_ONLY = "The plot is open for reading only. To change it, save a copy in step 1."
 
 
 def _hint(status: PlotStatus, active: StepName) -> str:
@@ -83,9 +90,9 @@ def _hint(status: PlotStatus, active: StepName) -> str:
     return f'<div class="dbh-hint dbh-row" data-level="{level}"><span>{esc(status.hint())}</span>{button}</div>'
 
 
-def _history_button(kind: str, title: str, label: str) -> str:
-    state = "" if label else " disabled"
-    tip = f"{kind.capitalize()}: {label}" if label else ""
+def _history_button(kind: str, title: str, label: str, locked: str) -> str:
+    state = "" if label and not locked else " disabled"
+    tip = locked or (f"{kind.capitalize()}: {label}" if label else "")
     return f'<button type="button" data-do="{kind}" title="{esc(tip)}" onclick="{call(kind)}"{state}>{title}</button>'
 
 

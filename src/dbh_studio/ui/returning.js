@@ -1,14 +1,15 @@
-/* Which page this is, and whether the studio can be reached. The name outlives a lost connection, a reload and a page
-   that the browser put to sleep; a second page has another. */
+/* Which page this is, and whether the studio can be reached. The names outlive a lost connection, a reload and a page
+   that the browser put to sleep. Each connection has one of its own: the browser hands those of a page on to its copy,
+   and the two must not be taken for one. Several are said, for the latest may never have arrived. */
 (() => {
-  const key = 'dbh-page';
-  let page = window.dbhPage;
-  try { page = page || sessionStorage.getItem(key); } catch (error) { /* the browser keeps nothing */ }
-  const returns = Boolean(page);
-  page = page || Array.from({length: 4}, () => Math.random().toString(36).slice(2, 8)).join('');
-  window.dbhPage = page;
-  try { sessionStorage.setItem(key, page); } catch (error) { /* as above */ }
-  dbh('page', [page, returns]);
+  const key = 'dbh-pages';
+  let names = window.dbhPages;
+  try { names = names || JSON.parse(sessionStorage.getItem(key)); } catch (error) { /* the browser keeps nothing */ }
+  names = Array.isArray(names) ? names.filter(each => typeof each === 'string') : [];
+  const name = Array.from({length: 4}, () => Math.random().toString(36).slice(2, 8)).join('');
+  dbh('page', [name, names]);
+  window.dbhPages = [name, ...names].slice(0, 9);
+  try { sessionStorage.setItem(key, JSON.stringify(window.dbhPages)); } catch (error) { /* as above */ }
   if (window.dbhWatch) return;
   // viser puts a function that only complains in the place of the one that sends.
   const isLost = () => String(window.__viserMutable.sendMessage).includes('is not connected');

@@ -91,10 +91,11 @@ class Studio(StudioJobs):
         with self._lock:
             self._tabs[worker.client.client_id] = tab
         worker.on_close(lambda: self._forget_tab(worker.client.client_id))
+        # Before it shows anything: the answer comes before whatever a person does with what is shown.
+        tab.returning.ask()
         tab.adopt_session()
         tab.show_job(self._job)
         self._tell_of_opening(tab)
-        tab.returning.ask()
 
     def _forget_tab(self, client_id: int) -> None:
         with self._lock:
@@ -127,6 +128,7 @@ class Studio(StudioJobs):
         if before is not None:
             before.close()
         self.lost_pages.clear()
+        self._each_tab(lambda tab: tab.returning.plot_opened())
         if isinstance(session.saver, Autosave):
             session.saver.subscribe(self._save_status_changed)
         self.masks.plot_opened()
@@ -188,6 +190,9 @@ class Studio(StudioJobs):
         here = threading.current_thread()
         with self._lock:
             tabs = list(self._tabs.values())
+        for tab in tabs:
+            if not tab.worker.is_run_by(here):
+                tab.returning.changed_elsewhere(change.before)
         # Not every stroke of a row of them: the notes would cover the plot.
         is_due = time.monotonic() - self._others_told_at > _BETWEEN_NOTES_S
         if is_due and any(tab.worker.is_run_by(here) for tab in tabs):

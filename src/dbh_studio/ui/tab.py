@@ -250,6 +250,7 @@ class Tab:
             undo=session.undo_label if session is not None else "",
             redo=session.redo_label if session is not None else "",
             is_busy=self._job_box.visible,
+            is_read_only=session is not None and session.is_read_only,
         )
         set_content(self._header, content)
 

@@ -9,11 +9,12 @@ from dbh_studio.io.exports.geopackage import write_geopackage
 from dbh_studio.io.exports.report_html import report_html, write_report_html
 from dbh_studio.io.exports.scene_html import write_scene_html
 from dbh_studio.io.exports.spreadsheet import write_xlsx
-from dbh_studio.io.exports.stem_profiles import write_profiles_csv
+from dbh_studio.io.exports.stem_profiles import profile_table, write_profiles_csv
 
 __all__ = [
     "Column",
     "Table",
+    "profile_table",
     "report_html",
     "table_of",
     "write_dxf",

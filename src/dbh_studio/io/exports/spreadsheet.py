@@ -1,4 +1,4 @@
-"""The inventory as an Excel workbook: the stems, the stand table, the edits, and how it was measured."""
+"""The inventory as an Excel workbook: the stems, the stand table, the profiles, the edits, and how it was measured."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ def write_xlsx(
     *,
     about: Mapping[str, str] | None = None,
     log: Sequence[LogEntry] = (),
+    profiles: Table | None = None,
 ) -> Path:
-    """Write a workbook with the sheets Stems, Stand (where it is given), Edits and About (likewise).
+    """Write a workbook with the sheets Stems, Stand (where it is given), Stem profiles, Edits and About (likewise).
 
     Text is written as text: nothing in a note becomes a formula or a link.
 
@@ -39,6 +40,7 @@ def write_xlsx(
         stand: The stand table.
         about: Facts to go with it, such as how breast height was taken.
         log: What was done to the plot.
+        profiles: Diameters along the stems (`profile_table`).
 
     Raises:
         FileError: It cannot be written.
@@ -55,9 +57,11 @@ def write_xlsx(
     options = {"in_memory": True, "strings_to_formulas": False, "strings_to_urls": False, "strings_to_numbers": False}
     with xlsxwriter.Workbook(content, options) as book:
         head = book.add_format({"bold": True, "bottom": 1, "text_wrap": True, "valign": "top"})
-        _stems(book, table, head)
+        _table(book, "Stems", table, head, n_fixed=3)
         if stand is not None:
             _stand(book, stand, head)
+        if profiles is not None:
+            _table(book, "Stem profiles", profiles, head, n_fixed=4)
         if log:
             _edits(book, log, head)
         if about:
@@ -72,20 +76,22 @@ def write_xlsx(
     return path
 
 
-def _stems(book: Any, table: Table, head: Any) -> None:
-    sheet = book.add_worksheet("Stems")
-    sheet.freeze_panes(1, 3)
+def _table(book: Any, name: str, table: Table, head: Any, *, n_fixed: int) -> None:
+    """A sheet with a table, whose first columns stay in sight."""
+    sheet = book.add_worksheet(name)
+    sheet.freeze_panes(1, n_fixed)
+    rows = table.rows[:_MOST_ROWS]
     formats = {suffix: book.add_format({"num_format": text}) for suffix, text in _FORMATS.items()}
     for index, column in enumerate(table.columns):
         sheet.write_string(0, index, column.name, head)
         shown = next((made for suffix, made in formats.items() if column.name.endswith(suffix)), None)
-        cells = [row[index] for row in table.rows]
+        cells = [row[index] for row in rows]
         longest = max([len(str(cell)) for cell in cells if isinstance(cell, str)], default=8)
         sheet.set_column(index, index, min(max(8, len(column.name), longest), _WIDEST))
         for number, cell in enumerate(cells, start=1):
             _write(sheet, number, index, cell, shown)
-    if table.rows:
-        sheet.autofilter(0, 0, len(table.rows), len(table.columns) - 1)
+    if rows:
+        sheet.autofilter(0, 0, len(rows), len(table.columns) - 1)
 
 
 def _stand(book: Any, stand: StandTable, head: Any) -> None:

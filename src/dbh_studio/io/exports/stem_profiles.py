@@ -1,4 +1,4 @@
-"""The diameters along each stem, every 10 cm, as CSV: metric, so that it can be read back as the inventory can."""
+"""The diameters along each stem, every 10 cm: as CSV, metric, so that it can be read back, and as a table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dbh_studio.core.inventory import Inventory
-from dbh_studio.io.exports.columns import written_whole
+from dbh_studio.core.stand import Units
+from dbh_studio.io.column_names import in_units
+from dbh_studio.io.exports.columns import Column, Kind, Table, written_whole
 from dbh_studio.io.inventory_csv import defused
 
 # It measures, with all that takes; a table of it needs none of that.
@@ -18,6 +20,15 @@ if TYPE_CHECKING:
 
 HEIGHT_COLUMNS = ("height_m", "dbh_cm", "dbh_lo_cm", "dbh_hi_cm", "coverage_deg", "reason")
 PROFILE_COLUMNS = ("plot_id", "tree_id", "stem_id", "tag", *HEIGHT_COLUMNS)
+_KINDS: dict[str, Kind] = {
+    "plot_id": "text", "tree_id": "integer", "stem_id": "integer", "tag": "text", "reason": "text",
+}  # fmt: skip
+
+
+def _ends_cm(point: ProfilePoint) -> tuple[float | None, float | None, float | None]:
+    """Diameter and interval."""
+    diameter = point.diameter
+    return (None, None, None) if diameter is None else (diameter.value_cm, diameter.low_cm, diameter.high_cm)
 
 
 def height_cells(point: ProfilePoint) -> dict[str, str]:
@@ -28,12 +39,31 @@ def height_cells(point: ProfilePoint) -> dict[str, str]:
         "coverage_deg": arc,
         "reason": point.reason,
     }
-    diameter = point.diameter
-    if diameter is not None:
-        ends = (diameter.value_cm, diameter.low_cm, diameter.high_cm)
-        texts = ("" if end is None else f"{end:.2f}" for end in ends)
-        cells |= dict(zip(HEIGHT_COLUMNS[1:4], texts, strict=True))
-    return cells
+    texts = ("" if end is None else f"{end:.2f}" for end in _ends_cm(point))
+    return cells | dict(zip(HEIGHT_COLUMNS[1:4], texts, strict=True))
+
+
+def profile_table(
+    inventory: Inventory, profiles: Iterable[tuple[int, Sequence[ProfilePoint]]], units: Units = "metric"
+) -> Table:
+    """The profiles of stems as a table: `PROFILE_COLUMNS` in these units, a row per height; None is not known.
+
+    Args:
+        inventory: The plot's, for what the stems are called.
+        profiles: By number of the stem.
+        units: Of diameters and heights.
+    """
+    named = {name: in_units(name, units) for name in PROFILE_COLUMNS}
+    about = {row.stem_id: (row.plot_id, row.tree_id, row.stem_id, row.tag) for row in inventory}
+    cells = (
+        (*about[stem_id], point.height_m, *_ends_cm(point), point.arc_deg, point.reason)
+        for stem_id, profile in profiles
+        for point in profile
+    )
+    columns = tuple(Column(name, _KINDS.get(key, "real")) for key, (name, _) in named.items())
+    turned = [turn for _, turn in named.values()]
+    rows = tuple(tuple(turn(cell) for turn, cell in zip(turned, row, strict=True)) for row in cells)
+    return Table(columns, rows, inventory, units)
 
 
 def write_profiles_csv(
