@@ -323,9 +323,9 @@ class EstimatorSettings(SettingsModel):
     # Lower than the 0.1 m a person may ask for: along a stem that leans by 45° that is 0.07 m above the base.
     breast_height_m: float = setting(1.30, "Height of measurement", unit="m", ge=0.05, le=100.0)
     below_m: float = setting(
-        0.50, "Stem used below", unit="m", ge=0.05, le=2.0, help="axis and taper are found from this stretch of stem"
+        0.70, "Stem used below", unit="m", ge=0.05, le=2.0, help="axis and taper are found from this stretch of stem"
     )
-    above_m: float = setting(0.70, "Stem used above", unit="m", ge=0.05, le=3.0)
+    above_m: float = setting(0.90, "Stem used above", unit="m", ge=0.05, le=3.0)
     band_m: float = setting(
         0.60, "Circle's band", unit="m", ge=0.02, le=2.0, help="height of the band the plain circle is fitted to"
     )
@@ -350,7 +350,7 @@ class EstimatorSettings(SettingsModel):
         help="expected share of the diameter by which a tape on the ridges exceeds the curve; visible bark decides",
     )
     bloat_chance: float = setting(
-        0.2, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared far more than usual; 0: never"
+        0.1, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared far more than usual; 0: never"
     )
     bloat_m: float = setting(
         0.001, "Usual bloat", unit="m", ge=0.0, le=0.1, help="by how much surfaces are smeared outwards, on average"

@@ -151,15 +151,42 @@ class TestTruth:
 
 
 class TestRobust:
-    def test_ferns_stubs_and_a_bank(self):
-        rng = np.random.default_rng(5)
+    @staticmethod
+    def _in_the_undergrowth(seed):
+        rng = np.random.default_rng(seed)
         fern = np.column_stack([rng.normal(0.5, 0.15, (600, 2)), rng.uniform(0.3, 1.4, 600)])
         along = rng.uniform(0.2, 0.7, (300, 1))
         stub = along * [-0.9, 0.3, 0.2] + [0, 0, 1.3] + rng.normal(0, 0.01, (300, 3))
         ground = np.column_stack([rng.uniform(-1, 1, (500, 2)), rng.uniform(0.3, 0.95, 500)])
         ground = ground[np.hypot(ground[:, 0], ground[:, 1]) > 0.21]
-        points = np.concatenate([stem(arc_deg=220, n=1800), fern, stub, ground])
-        assert measured(points, settings=SMOOTH).dbh_cm == pytest.approx(40.0, rel=0.02)
+        return np.concatenate([stem(arc_deg=220, n=1800, seed=seed), fern, stub, ground])
+
+    def test_ferns_stubs_and_a_bank(self):
+        found = [measured(self._in_the_undergrowth(seed), settings=SMOOTH).chosen for seed in range(5, 15)]
+        assert np.median([each.value_cm for each in found]) == pytest.approx(40.0, rel=0.01)
+        assert [each.value_cm for each in found] == pytest.approx([40.0] * len(found), rel=0.03)
+        assert sum(each.low_cm <= 40.0 <= each.high_cm for each in found) >= 7
+
+    @pytest.mark.parametrize("radius", [0.2, 0.35])
+    def test_strays_on_the_far_side_do_not_make_it_seen(self, radius):
+        """One in ten degrees lies where the far side would be; the front has two hundred."""
+        rng = np.random.default_rng(4)
+        angle = np.radians(np.arange(75.0, 290.0, 10.0))
+        out = (radius + rng.normal(0, 0.004, len(angle)))[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        strays = np.column_stack([out, rng.uniform(0.6, 2.2, len(angle))])
+        points = np.concatenate([stem(radius, arc_deg=120, n=2300, noise=0.006), strays])
+        found = assess_stem(points, settings=SMOOTH).result
+        assert found.arc_deg == pytest.approx(120, abs=25)
+        assert found.gap_deg > 200
+        assert found.chosen.low_cm <= 200 * radius <= found.chosen.high_cm
+
+    def test_a_stem_seen_only_far_above_has_no_diameter(self):
+        """Its axis and taper would tell something of breast height, but nobody has seen it there."""
+        refusal = estimate_diameter(stem(z=(1.95, 2.3), n=1500))
+        assert isinstance(refusal, Refusal)
+        assert refusal.code == "no_band"
+        assert "1.90 m" in refusal.reason
+        assert isinstance(estimate_diameter(stem(z=(1.7, 2.3), n=1500)), EstimatorResult)
 
     def test_neighbour_is_not_averaged_but_said(self):
         other = stem(0.15, n=1200, arc_deg=240, seed=1) + [0.38, 0.0, 0.0]

@@ -96,7 +96,7 @@ class TestNoDrift:
     def test_passes_are_not_believed(self, oval, arc_deg):
         tube, passes = look(cylinder(3, oval=oval, arc_deg=arc_deg))
         assert passes.probability < 0.45
-        assert passes.trust < 0.03
+        assert passes.trust < 0.1  # of which a twentieth counts as none
         assert passes.radius_m == pytest.approx(tube.radius, rel=0.02)
 
     def test_the_diameter_stays(self, oval, arc_deg, monkeypatch):

@@ -171,7 +171,7 @@ class TestFork:
         assert len(result.rings) == 2
 
     def test_no_one_of_two_is_meant(self):
-        refusal = estimate_diameter(self.fork(n=2200))
+        refusal = estimate_diameter(self.fork(n=2800))
         assert isinstance(refusal, Refusal)
         assert refusal.code == "two_rings"
         assert "fork" in refusal.reason

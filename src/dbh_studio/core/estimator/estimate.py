@@ -31,6 +31,7 @@ from dbh_studio.settings import EstimatorSettings
 
 _DEFAULTS = EstimatorSettings()
 _FURTHEST_M = 1e9  # from the origin: beyond any survey coordinate, and squares stay finite
+_NEAR_M = 0.6  # from breast height
 _SURE_RING = 0.05  # standard deviation of a ring's points, relative to its radius, where none is told
 
 
@@ -91,9 +92,11 @@ def assess_stem(
     points = as_points(points_m, name="points_m")
     seed = settings.seed if seed is None else seed
     used = _window(points, settings)
-    if len(used) < settings.min_points:
+    near = _near(settings)
+    n_near = int(np.count_nonzero((used[:, 2] >= near[0]) & (used[:, 2] <= near[1])))
+    if n_near < settings.min_points:
         heights = finite_points(points)[:, 2].astype(np.float64)
-        return Assessment(None, too_few(heights, len(used), _stretch(settings), settings))
+        return Assessment(None, too_few(heights, n_near, near, settings))
     local, origin = _local(used, settings, seed)
     stems = _stems(local, origin, line, settings, seed)
     found = no_ring(len(local), settings) if stems is None else _fitted(stems, settings, seed)
@@ -166,6 +169,12 @@ def _stretch(settings: EstimatorSettings) -> tuple[float, float]:
     return settings.breast_height_m - settings.below_m, settings.breast_height_m + settings.above_m
 
 
+def _near(settings: EstimatorSettings) -> tuple[float, float]:
+    """The part of the stretch that must hold points: from farther away breast height would only be guessed."""
+    low, high = _stretch(settings)
+    return max(low, settings.breast_height_m - _NEAR_M), min(high, settings.breast_height_m + _NEAR_M)
+
+
 def _local(used: Float64, settings: EstimatorSettings, seed: int) -> tuple[Float64, Float64]:
     """(N, 3) sample of the points about an origin at breast height, and that origin."""
     # Rounded, so that a plot's survey coordinates cost no digits and the sample does not depend on the median's last.
@@ -228,7 +237,10 @@ def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings
         return None
     posterior = posterior_of(patches, tube, prior if is_ring else replace(prior, highest=1), seed=seed)
     tube = posterior.tube if is_ring else replace(tube, radius=tube.radius + patches.shift_m)
-    evidence = evidence_of(local, tube)
+    # About a stem that leans, points away from an upright circle's band speak against it, and should not.
+    is_upright = not is_ring and settings.axis == "vertical"
+    shown = local[np.abs(local[:, 2]) <= 0.5 * settings.band_m] if is_upright else local
+    evidence = evidence_of(shown, tube)
     if evidence is None:
         return None
     signs = None if curve is None else heap_signs_of(local, curve, prior)

@@ -35,9 +35,9 @@ _DOUBT = 0.05  # trust up to which nothing is moved
 _ROUND = 0.003  # ovals below this are alike
 _LEAST_SIGMA_M, _MOST_SIGMA_M = 0.002, 0.04
 # Intercept, and slopes on the signs in the order of `Passes.signs`; printed by `bench/estimator_passes.py`.
-_CHANCE = np.array([0.607, 10.6, 0.772, -0.615, -0.229, -0.612, -3.43, 2.22, -0.235, -1.32, 1.3])
-_TRUST = np.array([-13.0, 4.53, 1.15, -0.0124, -1.08, 3.28, 0.142, 5.2, -0.127, 0.151, -0.443])
-_LOOK = np.array([1.26, 4.78, 1.46, 0.198, 0.194, 0.696])  # the same of `is_suspect`
+_CHANCE = np.array([-0.298, 11.0, 0.632, -0.473, -0.242, -0.696, -3.18, 2.68, -0.255, -1.16, 1.08])
+_TRUST = np.array([-9.3, 5.73, -0.0885, -0.853, -0.759, 2.55, -0.0247, 4.81, -0.133, -0.784, 0.231])
+_LOOK = np.array([0.379, 5.57, 0.922, 0.379, 0.305, 0.413])  # the same of `is_suspect`
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,7 +135,7 @@ def posterior_of(patches: Patches, tube: Tube, prior: StemPrior, *, seed: int) -
     belief /= belief.sum()
     inverse = np.linalg.inv(normal)
     root: Float64 = np.linalg.cholesky(0.5 * (inverse + np.swapaxes(inverse, -1, -2)))
-    diameters, outline_sd = _diameters(radii, best, root, belief, tube.sigma, seed)
+    diameters, outline_sd = _diameters(radii, best, root, belief, seed)
     width_at, node_at = np.unravel_index(int(belief.argmax()), belief.shape)
     found = best[width_at, node_at]
     centre, slope = fitted.place.moved(best[width_at])
@@ -262,7 +262,7 @@ def _linear(points: Float64, weight: Float64, places: _Places, precision: Float6
 
 
 def _diameters(
-    radii: Float64, best: Float64, root: Float64, belief: Float64, sigma: float, seed: int
+    radii: Float64, best: Float64, root: Float64, belief: Float64, seed: int
 ) -> tuple[dict[str, tuple[float, float, float]], Float64]:
     """Quantiles of the diameters over draws of the waves, and (72,) the outline's standard deviation."""
     n_widths, n_nodes, n_params = best.shape
@@ -270,9 +270,7 @@ def _diameters(
     waves = (best[:, :, None] + np.matmul(draws, np.swapaxes(root, -1, -2)))[..., 5:]
     highest = 1 + waves.shape[-1] // 2
     basis = wave_basis(np.cos(_ANGLE), np.sin(_ANGLE), highest)
-    # Noise across the surface lengthens distances to the axis by half its square over the radius, on average.
-    shorter = 0.25 * sigma**2 / (2.0 * radii)
-    outline = (radii - shorter)[None, :, None, None] + waves @ basis
+    outline = radii[None, :, None, None] + waves @ basis
     outline = np.maximum(outline, 0.2 * radii[None, :, None, None]).reshape(-1, N_OUTLINE)
     count = np.repeat(belief.ravel() / _DRAWS, _DRAWS)
     keep = count > 3e-4 * count.max()
