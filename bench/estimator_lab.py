@@ -5,7 +5,7 @@
     python bench/estimator_lab.py --development          the same on seeds from 15 000, for choosing
     python bench/estimator_lab.py --real [FOLDER]        eight real slices with a tape, whole and cut to arcs
 
-Every method gets the same stretch of stem and the same axis (a round tube fitted to 0.8-2.0 m). The paper's Fourier
+Every method gets the same stretch of stem and the same axis (a round tube fitted to 0.6-2.2 m). The paper's Fourier
 curve stands there twice: by the paper's words (`as_published`), and with a gate about a robust circle, the tape's
 definition, and the tolerance, origin and factor that did best on development seeds (`TUNED`), as the other curves and
 the circles do. Curves work in a band of 30 cm about 1.30 m, circles in 60 cm, the better of the two. For the errors

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dbh_studio.errors import SettingError
-from dbh_studio.settings import MeasureSettings, Settings, TrunkSettings
+from dbh_studio.settings import EstimatorSettings, MeasureSettings, Settings, TrunkSettings
 
 
 @pytest.mark.parametrize(
@@ -56,3 +56,10 @@ def test_a_plot_saved_before_there_were_intervals_keeps_its_method():
 def test_the_papers_way_in_one_word():
     paper = MeasureSettings.paper()
     assert (paper.curve, paper.definition, paper.ring_gate, paper.tolerance_share) == ("fourier", "curve", 0.0, 0.0)
+
+
+def test_the_estimator_by_itself_expects_what_the_program_does() -> None:
+    """What stands in both: a diameter by `estimate_diameter` is that of the studio."""
+    alone, in_program = EstimatorSettings(), MeasureSettings()
+    for name in set(type(alone).model_fields) & set(type(in_program).model_fields) - {"method", "axis", "definition"}:
+        assert getattr(alone, name) == getattr(in_program, name), name

@@ -350,7 +350,7 @@ class EstimatorSettings(SettingsModel):
         help="expected share of the diameter by which a tape on the ridges exceeds the curve; visible bark decides",
     )
     bloat_chance: float = setting(
-        0.1, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared far more than usual; 0: never"
+        0.2, "Chance of bloat", ge=0.0, lt=1.0, help="that a surface is smeared far more than usual; 0: never"
     )
     bloat_m: float = setting(
         0.001, "Usual bloat", unit="m", ge=0.0, le=0.1, help="by how much surfaces are smeared outwards, on average"

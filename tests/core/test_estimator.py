@@ -180,6 +180,23 @@ class TestRobust:
         assert found.gap_deg > 200
         assert found.chosen.low_cm <= 200 * radius <= found.chosen.high_cm
 
+    @pytest.mark.parametrize("n", [50, 60, 80])
+    def test_few_points_all_round_are_a_whole_ring(self, n):
+        """Where a sector has two points or so by chance one has none."""
+        found = [measured(stem(n=n, z=(0.6, 2.2), seed=seed), settings=SMOOTH) for seed in range(10)]
+        assert np.median([each.arc_deg for each in found]) >= 300
+        assert min(each.arc_deg for each in found) > 180
+
+    def test_a_side_that_one_scanner_stood_before_does_not_hide_the_rest(self):
+        """A sixth of the ring is thirty times as dense as what is left of it, and all of it is bark."""
+        rng = np.random.default_rng(7)
+        angle = np.where(rng.random(2500) < 0.86, rng.uniform(-30, 30, 2500), rng.uniform(30, 330, 2500))
+        radius, height = 0.2 + rng.normal(0, 0.004, 2500), rng.uniform(0.6, 2.2, 2500)
+        points = np.column_stack([radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle)), height])
+        result = measured(points, settings=SMOOTH)
+        assert result.arc_deg > 180
+        assert result.dbh_cm == pytest.approx(40.0, rel=0.02)
+
     def test_a_stem_seen_only_far_above_has_no_diameter(self):
         """Its axis and taper would tell something of breast height, but nobody has seen it there."""
         refusal = estimate_diameter(stem(z=(1.95, 2.3), n=1500))
@@ -381,6 +398,12 @@ class TestCircle:
 
     def test_upright_axis_does_not_lean(self):
         assert measured(stem(lean_deg=10), settings=SMOOTH.changed(method="circle", axis="vertical")).lean_deg == 0.0
+
+    def test_a_lean_is_not_taken_for_bloat_by_an_upright_circle(self):
+        """Away from its band the points of a stem that leans lie beside the circle, as smeared ones would."""
+        options = EstimatorSettings(method="circle", axis="vertical", bark_share=0.0)
+        found = [measured(stem(lean_deg=3, n=5000, seed=seed), settings=options).dbh_cm for seed in range(5)]
+        assert np.median(found) == pytest.approx(40.0, rel=0.02)
 
 
 class TestInterval:

@@ -17,6 +17,7 @@ from dbh_studio.app.section_edits import (
 )
 from dbh_studio.core.corrections import Correction
 from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.core.interval_methods import estimator_settings
 from dbh_studio.core.measured import Diameter
 from dbh_studio.core.polygons import inside_polygon
 from dbh_studio.core.stem_profile import ProfilePoint
@@ -111,6 +112,23 @@ def test_what_is_drawn_round_are_the_points_of_that_side(session):
     shown = trunk.points[section.indices]
     assert set(shown[section.uv_m[:, 0] > 1e-6]) <= set(out)
     assert set(shown[section.uv_m[:, 0] < -1e-6]) <= set(left)
+
+
+def test_what_is_left_out_goes_from_all_of_the_stem_that_is_measured(session):
+    document = session.document
+    trunk = document.trunks[document.trunks.ids[0]]
+    stem = session.measurement(trunk.id)
+    section, measured = stem.result.section, estimator_settings(document.settings.measure, "shrinkage")
+    right = [[0.0, -5.0], [5.0, -5.0], [5.0, 5.0], [0.0, 5.0]]
+    both = [drawn_points(session, document, trunk.id, section, right, keep=keep) for keep in (False, True)]
+    points = session.points_world(document)[trunk.points]
+    above_m = points[:, 2] - stem.z_ground_m - section.hom_m
+    # Not those at its very ends: a millionth of a metre decides.
+    inside = (above_m > 1e-5 - measured.below_m) & (above_m < measured.above_m - 1e-5)
+    outside = (above_m < -1e-5 - measured.below_m) | (above_m > measured.above_m + 1e-5)
+    assert inside.sum() > 500
+    assert np.isin(trunk.points[inside], np.concatenate(both)).all()
+    assert not np.isin(trunk.points[outside], np.concatenate(both)).any()
 
 
 def test_to_leave_out_nothing_or_all_is_refused(session):

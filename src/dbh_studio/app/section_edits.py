@@ -19,10 +19,11 @@ from dbh_studio.core.polygons import inside_polygon
 from dbh_studio.core.section import CrossSection
 from dbh_studio.core.stem_profile import ProfilePoint
 from dbh_studio.errors import CommandError
+from dbh_studio.settings import EstimatorSettings
 
 Drawing = Literal["out", "keep", "ring"]
-# Of stem below and above the section that the estimator looks at beside it: what is left out there goes, too.
-_BELOW_M, _ABOVE_M = 0.5, 0.7
+# The stem below and above the section that the estimator looks at beside it: what is left out there goes, too.
+_MEASURED = EstimatorSettings()
 _MOST_CORNERS = 200
 
 
@@ -49,7 +50,8 @@ def drawn_points(
     z_ground_m = session.measurement(trunk_id, document=document).z_ground_m
     points = session.points_world(document)[trunk.points].astype(np.float64)
     points[:, 2] -= z_ground_m
-    low, high = min(section.band_m[0], section.hom_m - _BELOW_M), max(section.band_m[1], section.hom_m + _ABOVE_M)
+    low = min(section.band_m[0], section.hom_m - _MEASURED.below_m)
+    high = max(section.band_m[1], section.hom_m + _MEASURED.above_m)
     there = (points[:, 2] >= low) & (points[:, 2] <= high)
     there &= ~np.isin(trunk.points, np.array(document.record(trunk_id).correction("left_out") or (), np.int64))
     uv = section.stem_from_section.inverse().apply(points[there])[:, :2]

@@ -1,6 +1,6 @@
 """The methods that come with an interval, shrinkage curve and plain circle, as measurements of a stem.
 
-`core.estimator` finds axis, taper and outline together from 1.2 m of stem. Here its result gets the cross-section that
+`core.estimator` finds axis, taper and outline together from 1.6 m of stem. Here its result gets the cross-section that
 the studio shows, a grade, and the paper's curves beside it where they are wanted.
 """
 

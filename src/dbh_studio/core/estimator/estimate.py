@@ -92,11 +92,11 @@ def assess_stem(
     points = as_points(points_m, name="points_m")
     seed = settings.seed if seed is None else seed
     used = _window(points, settings)
-    near = _near(settings)
-    n_near = int(np.count_nonzero((used[:, 2] >= near[0]) & (used[:, 2] <= near[1])))
-    if n_near < settings.min_points:
-        heights = finite_points(points)[:, 2].astype(np.float64)
-        return Assessment(None, too_few(heights, n_near, near, settings))
+    for stretch, least in ((_stretch(settings), settings.min_points), (_near(settings), settings.min_points // 3)):
+        n_there = int(np.count_nonzero((used[:, 2] >= stretch[0]) & (used[:, 2] <= stretch[1])))
+        if n_there < least:
+            heights = finite_points(points)[:, 2].astype(np.float64)
+            return Assessment(None, too_few(heights, n_there, stretch, least))
     local, origin = _local(used, settings, seed)
     stems = _stems(local, origin, line, settings, seed)
     found = no_ring(len(local), settings) if stems is None else _fitted(stems, settings, seed)
@@ -232,20 +232,27 @@ def _by(method: str, stems: Stems, prior: StemPrior, settings: EstimatorSettings
     tube = curve if is_ring else circle_tube(local, start, prior, settings, seed=seed)
     if tube is None:
         return None
-    patches = patches_of(local, tube, bloat_chance=settings.bloat_chance, bloat_m=settings.bloat_m)
+    shown = local if is_ring or settings.axis == "stem" else _about_circle(local, settings)
+    patches = patches_of(shown, tube, bloat_chance=settings.bloat_chance, bloat_m=settings.bloat_m)
     if patches is None:
         return None
     posterior = posterior_of(patches, tube, prior if is_ring else replace(prior, highest=1), seed=seed)
     tube = posterior.tube if is_ring else replace(tube, radius=tube.radius + patches.shift_m)
-    # About a stem that leans, points away from an upright circle's band speak against it, and should not.
-    is_upright = not is_ring and settings.axis == "vertical"
-    shown = local[np.abs(local[:, 2]) <= 0.5 * settings.band_m] if is_upright else local
     evidence = evidence_of(shown, tube)
     if evidence is None:
         return None
     signs = None if curve is None else heap_signs_of(local, curve, prior)
     passes = _passes(local, tube, evidence, prior, settings) if is_ring else None
     return Found(local, tube, posterior, patches, evidence, method, signs, stems.others, passes)
+
+
+def _about_circle(local: Float64, settings: EstimatorSettings) -> Float64:
+    """(M, 3) points to hold against an upright circle: those of its band, where they are enough to tell something.
+
+    About a stem that leans the others lie beside it. They would pass for bark that is smeared, and speak against it.
+    """
+    band = local[np.abs(local[:, 2]) <= 0.5 * settings.band_m]
+    return band if len(band) >= settings.min_points else local
 
 
 def _passes(

@@ -22,10 +22,11 @@ _FULL_ARC_DEG = 300.0
 _GAP_DEG = 60.0
 _DRIFT_TO_MENTION = 0.75
 _FLUTED = 0.04  # of the fourth wave and up
-_BIN_COUNTS = (36, 24, 18, 12)
+_BIN_COUNTS = (36, 24, 18, 12, 8)
 _POINTS_PER_BIN = 6
 _BIN_DEVIATIONS = 2.0  # of the number of clutter points
 _BIN_SHARE, _BEST_BINS = 0.05, 0.9
+_BIN_PLENTY = 8.0  # points: as many in each sector are no strays, however many more the best ones hold
 _WALL_WINDOWS = 18
 _WALL_WINDOW_RAD = np.pi / 6
 _WALL_POINTS = 15
@@ -197,8 +198,9 @@ def _seen(angle: Float64, error: Float64, sigma: float) -> Float64:
 
     Points on the surface count, less half of those in the two layers of its thickness next to it: what is clutter all
     through has none left over, so a fern before the unseen side does not make it seen. What is left must stand out from
-    chance, and from what the best sectors hold: a handful of strays that happen to lie where the far side of a wrong
-    ring would be made an arc of 70° look like one of 180°, with a diameter 30 % off called sure to 2 %.
+    chance, and be no less than a twentieth of what the best sectors hold: a handful of strays that happen to lie where
+    the far side of a wrong ring would be made an arc of 70° look like one of 180°, with a diameter 30 % off called sure
+    to 2 %.
     """
     on, beside = np.abs(error) < 1.5 * sigma, (np.abs(error) >= 1.5 * sigma) & (np.abs(error) < 4.5 * sigma)
     n_bins = next((n for n in _BIN_COUNTS if on.sum() >= _POINTS_PER_BIN * n), _BIN_COUNTS[-1])
@@ -207,7 +209,7 @@ def _seen(angle: Float64, error: Float64, sigma: float) -> Float64:
     clutter = 0.5 * np.bincount(sector[beside], minlength=n_bins)
     around = 0.25 * (np.roll(clutter, 1) + 2.0 * clutter + np.roll(clutter, -1))
     (best,) = quantiles(held, (_BEST_BINS,))
-    least = np.maximum(_BIN_DEVIATIONS * np.sqrt(around + 1.0), _BIN_SHARE * best)
+    least = np.maximum(_BIN_DEVIATIONS * np.sqrt(around + 1.0), np.minimum(_BIN_SHARE * best, _BIN_PLENTY))
     return (held - clutter >= least).astype(np.float64)
 
 

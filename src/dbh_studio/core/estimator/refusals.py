@@ -18,15 +18,13 @@ _REMEDY = "Record the stem from its other side, or enter a tape value."
 _ARC_GAP_DEG = 120.0
 
 
-def too_few(heights_m: Float64, n_used: int, stretch_m: tuple[float, float], settings: EstimatorSettings) -> Refusal:
-    """Too few points, or none, between the lower and upper height of a stretch."""
+def too_few(heights_m: Float64, n_used: int, stretch_m: tuple[float, float], least: int) -> Refusal:
+    """Too few points, or none, between the lower and upper height of a stretch that must hold so many."""
     low, high = stretch_m
     if not len(heights_m):
         return Refusal("no_points", "The stem has no points.", "Segment the plot again, or add points by hand.")
     if n_used:
-        reason = (
-            f"Only {n_used} points between {low:.2f} and {high:.2f} m above ground; {settings.min_points} are needed."
-        )
+        reason = f"Only {n_used} points between {low:.2f} and {high:.2f} m above ground; {least} are needed."
         return Refusal("too_few_points", reason, "Record the stem from nearer, or enter a tape value.")
     lowest, highest = np.quantile(heights_m, [0.01, 0.99])
     return Refusal(

@@ -28,6 +28,10 @@ from dbh_studio.core.measured import Diameter, Flag, Refusal, SectionRing
 from dbh_studio.core.transforms import Similarity
 from dbh_studio.settings import EstimatorSettings
 
+_THIN = 0.75
+"""A curve among points that are wide beside the stem reads thin: by this times (noise / diameter)², relative. Found on
+development seeds; 0.05 % of a stem of 40 cm with 1 cm of noise, 0.8 % of one of 10."""
+
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
@@ -94,6 +98,10 @@ def judged(found: Found, origin: Float64, settings: EstimatorSettings, told: Tol
     logs = dict(found.posterior.quantiles)
     if found.method == "circle":  # its own radius, with the width of a round tube's posterior
         logs = {name: _moved_to(values, np.log(2.0 * found.tube.radius)) for name, values in logs.items()}
+    else:
+        thin = _THIN * (found.tube.sigma / (2.0 * found.tube.radius)) ** 2
+        logs = {name: _moved_to(values, values[1] + thin) for name, values in logs.items()}
+        found = replace(found, tube=found.tube.larger(float(np.exp(thin))))
     bark, _ = bark_share(found.points, found.tube, expected=settings.bark_share)
     logs["tape"] = _moved_to(logs["tape"], logs["tape"][1] + np.log1p(bark))
     if found.passes is not None:
