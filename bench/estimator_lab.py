@@ -2,6 +2,7 @@
 
     python bench/estimator_lab.py                        the benchmark: 40 stems per scenario, seeds from 10 000
     python bench/estimator_lab.py --first 900 -n 100     the same on seeds from 10 900
+    python bench/estimator_lab.py --first 900 20 -n 100 50    on seeds from 10 900 and from 10 020, in one table
     python bench/estimator_lab.py --development          the same on seeds from 15 000, for choosing
     python bench/estimator_lab.py --real [FOLDER]        eight real slices with a tape, whole and cut to arcs
 
@@ -20,7 +21,7 @@ import csv
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -197,7 +198,7 @@ if bench_dendromatics.is_installed():
     METHODS["dendromatics"] = dendromatics()
 
 
-def run(methods: dict[str, Method], seeds: range, scenarios: list[str]) -> dict[str, dict[str, list[tuple]]]:
+def run(methods: dict[str, Method], seeds: Sequence[int], scenarios: list[str]) -> dict[str, dict[str, list[tuple]]]:
     """Truth and answer of every method on every stem of every scenario."""
     found: dict[str, dict[str, list[tuple]]] = {name: {s: [] for s in scenarios} for name in methods}
     for scenario in scenarios:
@@ -332,8 +333,8 @@ def _cut(points: np.ndarray, middle: float, arc_deg: float) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-n", type=int, default=40, help="stems per scenario")
-    parser.add_argument("--first", type=int, default=0, help="skip so many seeds")
+    parser.add_argument("-n", type=int, nargs="+", default=[40], help="stems per scenario")
+    parser.add_argument("--first", type=int, nargs="+", default=[0], help="skip so many seeds; one for each -n")
     parser.add_argument("--development", action="store_true")
     parser.add_argument("--real", nargs="?", const=DEFAULT_FOLDER, type=Path)
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
@@ -342,8 +343,11 @@ def main() -> None:
     if options.real:
         treescope(options.real, {name: METHODS[name] for name in options.methods})
         return
-    first = (15_000 if options.development else 10_000) + options.first
-    found = run({name: METHODS[name] for name in options.methods}, range(first, first + options.n), options.scenarios)
+    if len(options.n) != len(options.first):
+        parser.error("as many numbers are needed after --first as after -n")
+    start = 15_000 if options.development else 10_000
+    seeds = [start + first + k for first, n in zip(options.first, options.n, strict=True) for k in range(n)]
+    found = run({name: METHODS[name] for name in options.methods}, seeds, options.scenarios)
     print_tables(found)
     RESULTS.mkdir(exist_ok=True)
     table = {name: {s: vars(score(rows)) for s, rows in by.items()} for name, by in found.items()}

@@ -198,9 +198,9 @@ def _seen(angle: Float64, error: Float64, sigma: float) -> Float64:
 
     Points on the surface count, less half of those in the two layers of its thickness next to it: what is clutter all
     through has none left over, so a fern before the unseen side does not make it seen. What is left must stand out from
-    chance, and be no less than a twentieth of what the best sectors hold: a handful of strays that happen to lie where
-    the far side of a wrong ring would be made an arc of 70° look like one of 180°, with a diameter 30 % off called sure
-    to 2 %.
+    chance, and be no less than a twentieth of what the best sectors hold, or eight points: a handful of strays that
+    happen to lie where the far side of a wrong ring would be made an arc of 70° look like one of 180°, with a diameter
+    30 % off called sure to 2 %.
     """
     on, beside = np.abs(error) < 1.5 * sigma, (np.abs(error) >= 1.5 * sigma) & (np.abs(error) < 4.5 * sigma)
     n_bins = next((n for n in _BIN_COUNTS if on.sum() >= _POINTS_PER_BIN * n), _BIN_COUNTS[-1])
