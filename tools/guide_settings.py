@@ -20,7 +20,7 @@ _ENTRY = re.compile(r"(?P<section>\w+)\.(?P<name>\w+) = (?P<value>.*?)(?: \[(?P<
 _INTRODUCTION = """\
 # Settings
 
-<!-- Written by tools/guide_settings.py; change the texts in src/dbh_studio/settings.py. -->
+<!-- Written by tools/guide_settings.py; change the texts in src/dbh_studio/settings/. -->
 
 Few plots need any of these. Where they are:
 

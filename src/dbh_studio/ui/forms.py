@@ -1,4 +1,4 @@
-"""Inputs made from the settings models: titles, units, bounds and help are written once, in `settings.py`."""
+"""Inputs made from the settings models: titles, units, bounds and help are written once, in `settings`."""
 
 from __future__ import annotations
 
