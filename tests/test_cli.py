@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from tests.threestems import STEMS, plot_cloud, plot_points, stem_points
 
-from dbh_studio.app import commands, doctor, opening, pipeline
+from dbh_studio.app import commands, doctor, opening, plot_run
 from dbh_studio.cli import build_parser, main
 from dbh_studio.cli.common import ProgressLine, photo_request
 from dbh_studio.core.cloud import PointCloud
@@ -346,7 +346,7 @@ def test_what_one_may_not_read_or_write(las, tmp_path, capsys):
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(las, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pipeline, "open_plot", lambda *_, **__: pytest.fail("the cloud was read"))
+    monkeypatch.setattr(plot_run, "open_plot", lambda *_, **__: pytest.fail("the cloud was read"))
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         assert "file is not a folder" in fails(capsys, ["run", las, "--out", out])
@@ -385,7 +385,7 @@ def test_a_full_disk_leaves_nothing_half_written(las, stems, tmp_path, capsys, m
 
 def test_a_defect_is_a_sentence_too_and_the_memory_may_run_out(las, tmp_path, capsys, monkeypatch):
     for error, said in ((MemoryError(), "memory"), (KeyError("axis"), "--verbose"), (KeyboardInterrupt(), "interr")):
-        monkeypatch.setattr(pipeline, "segment", lambda *_, error=error, **__: (_ for _ in ()).throw(error))
+        monkeypatch.setattr(plot_run, "segment", lambda *_, error=error, **__: (_ for _ in ()).throw(error))
         status = main(["run", str(las), "--out", str(tmp_path / "out")])
         message = capsys.readouterr().err
         assert said in message and "Traceback" not in message
@@ -398,14 +398,14 @@ def test_a_defect_is_a_sentence_too_and_the_memory_may_run_out(las, tmp_path, ca
 
 def test_two_runs_at_once_into_one_folder_do_not_mix(las, tmp_path, capsys, monkeypatch):
     arguments = ["run", str(las), "--out", str(tmp_path)]
-    segment = pipeline.segment
+    segment = plot_run.segment
 
     def overtaken(*args, **options):
-        monkeypatch.setattr(pipeline, "segment", segment)
+        monkeypatch.setattr(plot_run, "segment", segment)
         assert main([*arguments, "--quiet", "--breast-height", "2"]) == 0
         return segment(*args, **options)
 
-    monkeypatch.setattr(pipeline, "segment", overtaken)
+    monkeypatch.setattr(plot_run, "segment", overtaken)
     assert "already" in fails(capsys, arguments)
     assert read_project(tmp_path / "plot.dbh").settings.measure.breast_height_m == 2
     assert float(table((tmp_path / "plot.csv").read_text())[0]["hom_m"]) > 1.9
@@ -438,8 +438,8 @@ def stuck(step: str) -> str:
     """Python that makes `run` say so, and hang, where it comes to a step."""
     # Many short sleeps: a signal that comes just before a sleep begins, or to another thread, is told when it ends.
     return (
-        "import time\nfrom dbh_studio.app import pipeline\n"
-        f"pipeline.{step} = lambda *_, **__: (print('here', flush=True), [time.sleep(0.05) for _ in range(2400)])"
+        "import time\nfrom dbh_studio.app import plot_run\n"
+        f"plot_run.{step} = lambda *_, **__: (print('here', flush=True), [time.sleep(0.05) for _ in range(2400)])"
     )
 
 

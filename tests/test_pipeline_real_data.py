@@ -14,7 +14,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from dbh_studio.app import pipeline
+from dbh_studio.app import plot_run
 from dbh_studio.cli import main
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
@@ -111,7 +111,7 @@ def test_the_rendered_plot_with_its_scale(tmp_path):
     folder = data("synthetic_360")
     pose = json.loads((folder / "world_from_model.json").read_text())
     scale = pose["metres_per_unit"]
-    result = pipeline.run_plot(folder / "dense_unscaled.ply", tmp_path, scale=1.33231)
+    result = plot_run.run_plot(folder / "dense_unscaled.ply", tmp_path, scale=1.33231)
     result.session.close()
     rows = [row for row in result.session.inventory() if row.dbh_cm is not None]
     # The program stands the plot upright in a frame of its own: back to the file's, and from there to the truth's.

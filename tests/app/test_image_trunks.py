@@ -22,7 +22,7 @@ from dbh_studio.app.image_trunks import (
     trunks_from_masks,
 )
 from dbh_studio.app.mask_overlay import overlay_picture, write_overlay
-from dbh_studio.app.pipeline import open_plot
+from dbh_studio.app.opening import open_plot
 from dbh_studio.app.session import Session
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.transforms import Similarity

@@ -13,15 +13,14 @@ from tests.stages.small_forest import STAND, forest
 
 from dbh_studio.app import commands
 from dbh_studio.app.last_search import LastSearch, kept_search
+from dbh_studio.app.opening import open_plot, save_as
 from dbh_studio.app.pipeline import (
     apply_segmentation,
-    open_plot,
-    run_plot,
-    save_as,
     segment,
     segment_plot,
     segmentation_call,
 )
+from dbh_studio.app.plot_run import run_plot
 from dbh_studio.app.search_report import check_report, search_report, write_search_report
 from dbh_studio.cli import main
 from dbh_studio.core.cloud import PointCloud

@@ -13,18 +13,16 @@ import pytest
 from tests.app.plots import contents
 
 from dbh_studio.app import commands
+from dbh_studio.app.opening import open_plot, save_as, scale_from
 from dbh_studio.app.pipeline import (
     apply_segmentation,
     measure_stems,
     measurement_call,
-    open_plot,
-    run_plot,
-    save_as,
-    scale_from,
     segment,
     segment_plot,
     segmentation_call,
 )
+from dbh_studio.app.plot_run import run_plot
 from dbh_studio.app.session import Session
 from dbh_studio.core.cloud import PointCloud
 from dbh_studio.core.scale import ScaleEstimate

@@ -68,7 +68,7 @@ def add_commands(commands: Any) -> None:
 
 def run_plot(options: argparse.Namespace) -> int:
     """Run the whole chain."""
-    from dbh_studio.app import pipeline
+    from dbh_studio.app import plot_run
     from dbh_studio.app.search_report import check_report, write_search_report
 
     changes = settings_changes(options)
@@ -80,7 +80,7 @@ def run_plot(options: argparse.Namespace) -> int:
         raise SettingError("Both --scale and markers in photos were given.", "Leave one of them away.")
     try:
         with progress_for(options) as progress:
-            result = pipeline.run_plot(
+            result = plot_run.run_plot(
                 options.plot,
                 options.out,
                 scale=options.scale,

@@ -169,7 +169,7 @@ def _demo_session(demo: DemoPlot, out: Path, progress: ProgressLine) -> tuple[Se
 
     A plot that an earlier version of the demo left there is kept, edits and all; the new one gets a number.
     """
-    from dbh_studio.app import opening, pipeline
+    from dbh_studio.app import opening, pipeline, plot_run
     from dbh_studio.app.autosave import Autosave
     from dbh_studio.io.project import FOLDER_SUFFIX, PROJECT_FILE, ProjectWriter
 
@@ -177,7 +177,7 @@ def _demo_session(demo: DemoPlot, out: Path, progress: ProgressLine) -> tuple[Se
         name = demo.path.stem if number == 1 else f"{demo.path.stem}-{number}"
         project = out / f"{name}{FOLDER_SUFFIX}"
         if not (project / PROJECT_FILE).exists():
-            result = pipeline.run_plot(demo.path, out, plot_id="" if number == 1 else name, progress=progress)
+            result = plot_run.run_plot(demo.path, out, plot_id="" if number == 1 else name, progress=progress)
             # From now on an edit need not wait for the disk. Closed first: a plot has one writer.
             result.session.close()
             Autosave(result.session, ProjectWriter(project), label="Open the demo plot")

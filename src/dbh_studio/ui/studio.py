@@ -250,7 +250,7 @@ class Studio(StudioJobs):
     # ---- long work
 
     def open_plot(self, path: Path, **options: Any) -> None:
-        """Read a plot in the background and show it. `options` as for `pipeline.open_plot`.
+        """Read a plot in the background and show it. `options` as for `opening.open_plot`.
 
         Raises:
             StudioError: It is open already, the open plot cannot be saved, or another job runs.
