@@ -3,6 +3,7 @@
     python bench/estimator_lab.py                        the benchmark: 40 stems per scenario, seeds from 10 000
     python bench/estimator_lab.py --first 900 -n 100     the same on seeds from 10 900
     python bench/estimator_lab.py --first 900 20 -n 100 50    on seeds from 10 900 and from 10 020, in one table
+    python bench/estimator_lab.py --jobs 2               the same on two processes (times are then worth little)
     python bench/estimator_lab.py --development          the same on seeds from 15 000, for choosing
     python bench/estimator_lab.py --real [FOLDER]        eight real slices with a tape, whole and cut to arcs
 
@@ -19,16 +20,18 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import bench_dendromatics
 import numpy as np
-from estimator_stems import SCENARIOS, make_case
+from estimator_stems import SCENARIOS, in_stretch, make_case
 
 from dbh_studio.core.axis import StemAxis
 from dbh_studio.core.curves import CURVES
@@ -79,10 +82,10 @@ Method = Callable[[np.ndarray], Answer]
 def shared_axis(points: np.ndarray) -> StemAxis | None:
     """The axis all methods get: that of a round tube on the stretch the estimator uses."""
     settings = EstimatorSettings()
-    window = points[(points[:, 2] > 0.8) & (points[:, 2] < 2.0)]
+    window = points[in_stretch(points)]
     if len(window) < settings.min_points:
         return None
-    origin = np.array([*np.median(window[:, :2], axis=0), 1.3])
+    origin = np.array([*np.median(window[:, :2], axis=0), settings.breast_height_m])
     rng = np.random.default_rng(1)
     local = window[rng.permutation(len(window))[:2500]] - origin
     rings, _ = find_rings(local, widest_m=1.25, taper=settings.taper, rng=rng)
@@ -198,17 +201,26 @@ if bench_dendromatics.is_installed():
     METHODS["dendromatics"] = dendromatics()
 
 
-def run(methods: dict[str, Method], seeds: Sequence[int], scenarios: list[str]) -> dict[str, dict[str, list[tuple]]]:
-    """Truth and answer of every method on every stem of every scenario."""
-    found: dict[str, dict[str, list[tuple]]] = {name: {s: [] for s in scenarios} for name in methods}
-    for scenario in scenarios:
-        start = time.time()
-        for seed in seeds:
-            case = make_case(scenario, seed)
-            for name, method in methods.items():
-                found[name][scenario].append((case.tape_cm, method(case.points_m)))
-        print(f"{scenario}: {time.time() - start:.0f} s", file=sys.stderr, flush=True)
+def run(
+    names: list[str], seeds: Sequence[int], scenarios: list[str], *, jobs: int = 1
+) -> dict[str, dict[str, list[tuple]]]:
+    """Truth and answer of the methods of these names on every stem of every scenario."""
+    found: dict[str, dict[str, list[tuple]]] = {name: {} for name in names}
+    with ExitStack() as stack:
+        each: Callable = map if jobs == 1 else stack.enter_context(multiprocessing.Pool(jobs)).imap
+        for scenario in scenarios:
+            start = time.time()
+            rows = list(each(partial(_answers, names, scenario), seeds))
+            for place, name in enumerate(names):
+                found[name][scenario] = [(truth_cm, answers[place]) for truth_cm, answers in rows]
+            print(f"{scenario}: {time.time() - start:.0f} s", file=sys.stderr, flush=True)
     return found
+
+
+def _answers(names: list[str], scenario: str, seed: int) -> tuple[float, list[Answer]]:
+    """The tape of one stem, and what each method says of it."""
+    case = make_case(scenario, seed)
+    return case.tape_cm, [METHODS[name](case.points_m) for name in names]
 
 
 @dataclass(frozen=True)
@@ -335,6 +347,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-n", type=int, nargs="+", default=[40], help="stems per scenario")
     parser.add_argument("--first", type=int, nargs="+", default=[0], help="skip so many seeds; one for each -n")
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--development", action="store_true")
     parser.add_argument("--real", nargs="?", const=DEFAULT_FOLDER, type=Path)
     parser.add_argument("--methods", nargs="*", default=list(METHODS))
@@ -347,7 +360,7 @@ def main() -> None:
         parser.error("as many numbers are needed after --first as after -n")
     start = 15_000 if options.development else 10_000
     seeds = [start + first + k for first, n in zip(options.first, options.n, strict=True) for k in range(n)]
-    found = run({name: METHODS[name] for name in options.methods}, seeds, options.scenarios)
+    found = run(options.methods, seeds, options.scenarios, jobs=options.jobs)
     print_tables(found)
     RESULTS.mkdir(exist_ok=True)
     table = {name: {s: vars(score(rows)) for s, rows in by.items()} for name, by in found.items()}

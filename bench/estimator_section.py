@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from estimator_heaps import HEAPS, make_heap
-from estimator_stems import SCENARIOS, Scenario, clutter_about, make_case, seen_of, stem_of
+from estimator_stems import SCENARIOS, Scenario, clutter_about, in_stretch, make_case, seen_of, stem_of
 
 from dbh_studio.core.dbh import measure_stem
 from dbh_studio.core.estimator import assess_stem
@@ -79,7 +79,7 @@ def make_section(
         _outside(seen_of(_TWO_RINGS, each, n, float(rng.uniform(*_TWO_RINGS.arc_deg)), rng), stems, k)
         for k, (each, n) in enumerate(zip(stems, counts, strict=True))
     ]
-    own = np.array([int(((part[:, 2] > 0.8) & (part[:, 2] < 2.0)).sum()) for part in parts])
+    own = np.array([int(in_stretch(part).sum()) for part in parts])
     parts += clutter_about(first, int(n_points * rng.uniform(*_TWO_RINGS.clutter)), rng)
     points = np.concatenate(parts)
     centres = np.array([each.axis(np.array([BREAST_HEIGHT_M]))[0, :2] for each in stems])
@@ -230,7 +230,7 @@ def calibrate(seeds: range) -> None:
 def _signs(points: np.ndarray) -> HeapSigns | None:
     """As the estimator comes by them."""
     settings = EstimatorSettings()
-    points = points[(points[:, 2] >= 0.8) & (points[:, 2] <= 2.0)]
+    points = points[in_stretch(points)]
     if len(points) < settings.min_points:
         return None
     local = points[sample_points(points, settings.max_points, seed=0)]

@@ -15,6 +15,7 @@ import numpy as np
 from dbh_studio.core.synthetic.fields import WaveField
 from dbh_studio.core.synthetic.recipe import PlotRecipe
 from dbh_studio.core.synthetic.stems import BREAST_HEIGHT_M, Stem, make_stems
+from dbh_studio.settings import EstimatorSettings
 
 Range = tuple[float, float]
 _LOW_M, _HIGH_M = 0.25, 2.4
@@ -148,6 +149,13 @@ def make_case(name: str, seed: int, scenario: Scenario | None = None) -> Case:
     points = points[(points[:, 2] > 0.3) & (points[:, 2] < 2.3)]
     tape, curve, area = stem.diameters_cm(BREAST_HEIGHT_M)
     return Case(points[rng.permutation(len(points))], tape, curve, area, arc * scenario.faces)
+
+
+def in_stretch(points: np.ndarray) -> np.ndarray:
+    """(N,) whether points are on the stretch of stem that the estimator uses."""
+    settings = EstimatorSettings()
+    above = points[:, 2] - settings.breast_height_m
+    return (above >= -settings.below_m) & (above <= settings.above_m)
 
 
 def _log_uniform(rng: np.random.Generator, bounds: Range) -> float:
