@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -246,6 +247,18 @@ class TestRobust:
         assert "not_at_height" in codes(result)
         assert "not_at_height" not in codes(measured(stem()))
         assert result.chosen.holds(40.0)
+
+    def test_seen_above_and_below_breast_height_and_not_there(self):
+        points = stem(n=6000)
+        off, height = np.arctan2(points[:, 1], points[:, 0]), np.abs(points[:, 2] - 1.3)
+        for hidden, words in (((height < 0.3), "360°"), ((height < 0.3) & (np.abs(off) > 0.8), "2[4-9]0°")):
+            result = measured(points[~hidden])
+            (flag,) = [flag for flag in result.flags if flag.code == "not_at_height"]
+            assert re.search(words, flag.words)
+            assert result.chosen.holds(40.0)
+        # A hole in the bark's points is no such thing, nor are points so few that chance leaves sectors empty.
+        assert "not_at_height" not in codes(measured(points[~((height < 0.3) & (np.abs(off) < 0.5))]))
+        assert "not_at_height" not in codes(measured(stem(n=300)))
 
     def test_root_swell(self):
         assert "buttress" in codes(measured(stem(0.4, taper=0.06)))

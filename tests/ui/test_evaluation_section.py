@@ -173,7 +173,31 @@ def test_a_table_that_does_not_help_is_told(measured, tmp_path, content, words):
     measured.set("Field table", "" if content == "" else str(path))
     measured.press("Compare")
     measured.wait_notification(words)
-    measured.wait_text("Type where a table with field diameters lies")
+    measured.wait_text(words)
+    if content:
+        measured.wait_text("odd.csv")  # which table it is about
+    measured.wait(lambda t: "Type where a table" not in t.text())
+
+
+def test_a_table_that_helps_takes_the_place_of_what_was_wrong_with_the_last(measured, field, tmp_path):
+    open_step(measured)
+    measured.set("Field table", str(tmp_path / "nowhere.csv"))
+    measured.press("Compare")
+    measured.wait_text("there is no such file")
+    compare(measured, field)
+    measured.wait(lambda t: "there is no such file" not in t.text())
+
+
+def test_a_tree_without_a_diameter_is_named_by_its_number_here_and_a_click_leads_to_it(tmp_path):
+    trees = {"A": 31.0, "B": 22.0, "C": 45.0, "<D>": None}
+    inventory = ["tree_id,stem_id,dbh_cm,x_m,y_m"]
+    inventory += [f"{k},{k},{cm or ''},{5 * k},{k * k}" for k, cm in enumerate(trees.values(), start=1)]
+    field = ["Tree,DBH_cm,X,Y", *(f"{name},30,{5 * k},{k * k}" for k, name in enumerate(trees, start=1))]
+    for name, lines in (("inventory.csv", inventory), ("field.csv", field)):
+        (tmp_path / name).write_text("\n".join(lines), encoding="utf-8")
+    request = EvaluationRequest(tmp_path / "field.csv", inventories=(tmp_path / "inventory.csv",))
+    told = misfits(evaluate_files(request))
+    assert 'data-refused="4" onclick="dbh(&quot;row&quot;,4)">Tree 4</button> (field tree &lt;D&gt;)' in told
 
 
 def test_markup_in_the_table_stays_text(measured, field):

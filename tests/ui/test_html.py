@@ -261,6 +261,22 @@ def test_the_unseen_arc_is_dashed_and_the_interval_a_band(half_seen):
     assert drawn is not None and "stroke-dasharray" not in drawn.group() and "data-seen" not in whole
 
 
+@pytest.mark.parametrize("code", ["no_ring", "clutter", "small_arc"])
+def test_what_is_said_to_be_no_ring_is_not_drawn_as_one_that_is_known(half_seen, code):
+    refused = Refusal(code, "why", "what to do", section=half_seen.section, fits=half_seen.fits)
+    picture = section_svg(refused, curve="shrinkage")
+    is_known = code == "small_arc"  # its band says what else would agree with the points
+    assert ("data-band" in picture) == ("90 % interval" in picture) == ("data-seen" in picture) == is_known
+    outline = re.search(r'<polygon data-curve="shrinkage" [^>]+>', picture)
+    assert outline is not None and "stroke-dasharray" in outline.group()
+
+
+def test_a_diameter_of_another_height_than_the_plots_says_so(half_seen):
+    at = half_seen.section.hom_m
+    assert "as the plot" not in tree_card.tree_card(7, half_seen, plot_height_m=at)
+    assert f"{at:.2f} m, not {at + 0.5:.2f} m as the plot" in tree_card.tree_card(7, half_seen, plot_height_m=at + 0.5)
+
+
 def test_the_band_is_the_interval_on_average(half_seen):
     fit = half_seen.fits["shrinkage"]
     low, high = half_seen.interval

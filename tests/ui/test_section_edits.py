@@ -16,12 +16,14 @@ from dbh_studio.app.section_edits import (
     tape_cm,
 )
 from dbh_studio.core.corrections import Correction
-from dbh_studio.core.dbh import DbhEstimate
+from dbh_studio.core.dbh import DbhEstimate, Refusal
 from dbh_studio.core.interval_methods import estimator_settings
 from dbh_studio.core.measured import Diameter
 from dbh_studio.core.polygons import inside_polygon
 from dbh_studio.core.stem_profile import ProfilePoint
+from dbh_studio.core.tree_record import TreeRecord
 from dbh_studio.errors import CommandError
+from dbh_studio.ui.correction_html import corrections_html
 from dbh_studio.ui.profile_svg import profile_svg
 
 
@@ -73,6 +75,25 @@ def test_the_height_in_the_picture_of_the_stem_keeps_clear_of_its_axis_and_edge(
     width = 48  # of "1.00 m", 12 px high, and the axis' "31 cm" ends at 40
     left = float(found[0]) - {"start": 0, "middle": width / 2, "end": width}[anchor]
     assert left >= 40 and left + width <= 340
+
+
+def test_along_the_stem_the_line_is_dashed_where_nothing_was_measured():
+    size = Diameter(30.0, 29.0, 31.0)
+    seen = (0.5, 0.6, 0.7, 2.0, 3.0, 3.1)  # 2.0 alone
+    profile = tuple(ProfilePoint(k / 10, size if k / 10 in seen else None, 90.0) for k in range(5, 32))
+    svg = profile_svg(profile, height_m=1.3, tree_id=3)
+    (solid,) = re.findall(r'data-profile d="([^"]+)"', svg)
+    (dashed,) = re.findall(r'data-profile-unseen d="([^"]+)"[^>]*stroke-dasharray', svg)
+    assert [part.count("L") for part in solid.split("M")[1:]] == [2, 0, 1]
+    assert dashed.count("M") == dashed.count("L") == 2
+    whole = profile_svg([ProfilePoint(h, size, 360.0) for h in seen[:3]], height_m=0.6, tree_id=3)
+    assert 'data-profile-unseen d=""' in whole
+
+
+def test_that_height_is_counted_along_the_stem_is_said_in_words():
+    record = TreeRecord(corrections=(Correction("along", "stem", "", "", ""),))
+    said = re.sub("<[^>]*>", "", corrections_html(record, Refusal("no_ring", "why", "what"), ""))
+    assert "Height of a leaning stem along the stem" in said
 
 
 def test_other_heights_are_the_nearest_that_have_a_diameter():

@@ -84,7 +84,15 @@ class CardSection(Section):
             found = None if compared is None else other_heights(compared.profile, compared.height_m)
             actions = remedies_html(selected, result, found, serial=serial)
         scale = tree_card.scale_words(document.scale)
-        card = tree_card.tree_card(selected, result, section=picture + profile, scale=scale, said=said, actions=actions)
+        card = tree_card.tree_card(
+            selected,
+            result,
+            section=picture + profile,
+            scale=scale,
+            said=said,
+            actions=actions,
+            plot_height_m=document.settings.measure.breast_height_m,
+        )
         set_content(self._card, card + flag_html(selected, record.flag))
 
     def compared(self, document: Document, stem: StemMeasurement) -> Compared | None:

@@ -69,6 +69,8 @@ def _value(correction: Correction, record: TreeRecord, result: DbhEstimate | Ref
         return f"drawn by hand, {len(value)} corners"
     if correction.kind == "ground":
         return "placed by hand"
+    if correction.kind == "along":
+        return "along the stem" if value == "stem" else str(value)
     return CURVE_TITLES.get(value, str(value)) if correction.kind == "curve" else str(value)
 
 

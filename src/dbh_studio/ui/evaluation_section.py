@@ -12,7 +12,7 @@ import viser
 from dbh_studio.app import pipeline
 from dbh_studio.core.evaluation import ALL, MIN_N, Line, Sample
 from dbh_studio.core.evaluation_figures import scatter_svg
-from dbh_studio.errors import StudioError
+from dbh_studio.errors import FileError, StudioError
 from dbh_studio.io.evaluation_report import shown
 from dbh_studio.ui import html
 from dbh_studio.ui.bridge import call, esc
@@ -54,6 +54,7 @@ class EvaluationSection:
         # What was measured last by every method, and of which state of the plot.
         self._by_methods: tuple[Document, Sequence[StemMeasurement]] | None = None
         self._shown_for: Session | None = None
+        self._failed: StudioError | None = None
         self._offered = dict(_APART)
         gui, worker = tab.client.gui, tab.worker
         self._folder = gui.add_folder("Compare with field measurements", expand_by_default=False, visible=False)
@@ -101,7 +102,7 @@ class EvaluationSection:
         session = self.tab.session
         set_visible(self._folder, session is not None and len(session.document.trunks) > 0)
         if session is not self._shown_for:  # of another plot: its report must not be written over
-            self._shown_for, self._done, self._by_methods = session, None, None
+            self._shown_for, self._done, self._by_methods, self._failed = session, None, None, None
             for field in (self._path, self._out):
                 set_value(field, "")
             self._offer(_APART)
@@ -109,10 +110,10 @@ class EvaluationSection:
         for handle in (self._lines, self._plot, self._worst, self._tapes, self._out, self._write):
             set_visible(handle, self._done is not None)
         if self._done is None or session is None:
-            set_content(
-                self._state,
-                html.message("Type where a table with field diameters lies: its columns and units are found out."),
-            )
+            told = html.message("Type where a table with field diameters lies: its columns and units are found out.")
+            if self._failed is not None:
+                told = failure(self._failed)
+            set_content(self._state, told)
             return
         _, document, _, comparison = self._done
         is_old = session.document is not document
@@ -172,25 +173,28 @@ class EvaluationSection:
         from dbh_studio.core.comparison import Grouping
         from dbh_studio.core.stem_layout import PairingRule
 
-        path = typed_path(self._path.value)
-        if path is None:
-            raise StudioError("No table was named.", "Type the path of a table with diameters measured in the field.")
-        _check_measured(session, document)
-        compared = self._methods_of(document)
-        apart = self._offered.get(self._apart.value, "")
-        request = EvaluationRequest(
-            path,
-            by=(Grouping.parse(apart),) if apart else (),
-            rule=PairingRule(_PAIR_BY[self._by.value]),
-            every_method=self._methods.value and compared is not None,
-        )
-        self._done = None  # what is on screen must not pass for the answer while this one fails
+        self._done = self._failed = None  # what is on screen must not pass for the answer while this one fails
         try:
+            path = typed_path(self._path.value)
+            if path is None:
+                raise StudioError("No table was named.", "Type the path of a table of diameters measured in the field.")
+            _check_measured(session, document)
+            compared = self._methods_of(document)
+            apart = self._offered.get(self._apart.value, "")
+            request = EvaluationRequest(
+                path,
+                by=(Grouping.parse(apart),) if apart else (),
+                rule=PairingRule(_PAIR_BY[self._by.value]),
+                every_method=self._methods.value and compared is not None,
+            )
             comparison = evaluate_plot(session, request, document=document, compared=compared)
             self._done = session, document, request, comparison
             self._offer(_APART | columns_to_tell_apart(comparison))
             if not self._out.value:
                 set_value(self._out, str(_beside(session) / f"{document.plot_id or 'plot'}_evaluation"))
+        except StudioError as error:
+            self._failed = error
+            raise
         finally:
             self.refresh()
 
@@ -234,6 +238,12 @@ class EvaluationSection:
         pictures = section_pictures(session, comparison) if session.document is document else ()
         written = write_report(comparison, folder, pictures=pictures, sources=[request.reference])
         self.tab.worker.notify("Report written", f"{len(written)} files in {folder}; begin with report.md.", "success")
+
+
+def failure(error: StudioError) -> str:
+    """HTML: why nothing could be compared; it stands where the answer would, and never asks for what was given."""
+    where = f"{error.path.name}: " if isinstance(error, FileError) else ""
+    return html.message(f"{where}{error.problem}", level="stop", remedy=error.remedy)
 
 
 def _check_measured(session: Session, document: Document) -> None:
@@ -359,20 +369,28 @@ def misfits(comparison: Comparison) -> str:
         '<div class="dbh-scroll" tabindex="0"><table class="dbh-table"><thead><tr><th>Tree</th><th>Field</th>'
         f"<th>DBH</th><th>Tape</th><th>Error %</th></tr></thead><tbody>{rows}</tbody></table></div>"
     )
+    refused = [_refused(s, numbers.get(s.stem)) for s in samples if s.outcome == "refused"]
+    unmeasured = f"<div class=dbh-scroll tabindex=0><ul class=dbh-list>{''.join(refused)}</ul></div>" if refused else ""
     items = []
-    for outcome, words in (
-        ("refused", "has no diameter"),
-        ("missed", "was not found"),
-        ("unknown", "has no field diameter"),
-    ):
+    for outcome, words in (("missed", "was not found"), ("unknown", "has no field diameter")):
         some = [s for s in samples if s.outcome == outcome]
         items += [("note", f"Field tree {s.tree or '?'} {words}", s.reason) for s in some[:_OTHERS_SHOWN]]
         if len(some) > _OTHERS_SHOWN:
             items.append(("note", f"{len(some) - _OTHERS_SHOWN} more: the report lists them", ""))
     title = '<div class="muted">Worst pairs first, centimetres; click one to see the tree.</div>'
     notes = html.findings([("note", note, "") for note in comparison.notes])
+    rest = html.findings(items) if items else ""
     how = f'<details class="dbh"><summary>How the tables were read and paired</summary>{notes}</details>'
-    return f'<div class="dbh">{title}{table if rows else ""}</div>{html.findings(items) if items else ""}{how}'
+    return f'<div class="dbh">{title}{table if rows else ""}{unmeasured}</div>{rest}{how}'
+
+
+def _refused(sample: Sample, number: int | None) -> str:
+    """A tree without a diameter by its number here, where it can be mended: a click shows it."""
+    tree = f"Tree {esc(sample.stem)}"
+    if number is not None:
+        tree = f'<button type="button" data-refused="{number}" onclick="{call("row", number)}">Tree {number}</button>'
+    words = f"(field tree {sample.tree or '?'}) has no diameter here."
+    return f'<li data-level="note">{tree} {esc(words)} <span class="muted">{esc(sample.reason)}</span></li>'
 
 
 def _row(sample: Sample, number: int | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dbh_studio.core.stem_profile import ProfilePoint
+from dbh_studio.core.stem_profile import STEP_M, ProfilePoint
 
 _WIDTH, _HEIGHT = 340, 170
 _LEFT, _RIGHT, _TOP, _BOTTOM = 40, 10, 10, 26
@@ -41,12 +41,13 @@ def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float, tree_id: in
         for height, diameter in rows
         if diameter.low_cm is not None and diameter.high_cm is not None
     )
-    line = " ".join(f"{x(height):.1f},{y(diameter.value_cm):.1f}" for height, diameter in rows)
+    solid, dashed = _lines([height for height, _ in rows], [(x(h), y(diameter.value_cm)) for h, diameter in rows])
     text = 'font-size="12" font-family="sans-serif" fill="#495057"'
     return (
         f'<svg class="dbh-profile" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="Diameters along the stem">'
         f'<path data-intervals d="{bars}" stroke="{_CURVE}" stroke-width="3" opacity="0.35"/>'
-        f'<polyline data-profile points="{line}" fill="none" stroke="{_CURVE}" stroke-width="2"/>'
+        f'<path data-profile-unseen d="{dashed}" fill="none" stroke="{_CURVE}" stroke-dasharray="2 4"/>'
+        f'<path data-profile d="{solid}" fill="none" stroke="{_CURVE}" stroke-width="2" stroke-linecap="round"/>'
         f"{_breast_height(x(height_m), height_m, f'{bottom:.4f} {top:.4f}', tree_id)}"
         f'<text x="2" y="{_TOP + 10}" {text}>{high:.0f} cm</text>'
         f'<text x="2" y="{_HEIGHT - _BOTTOM}" {text}>{low:.0f} cm</text>'
@@ -56,9 +57,23 @@ def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float, tree_id: in
     )
 
 
+def _lines(heights_m: Sequence[float], pixels: Sequence[tuple[float, float]]) -> tuple[str, str]:
+    """SVG paths of what was measured, a dot where that is one height alone, and of what is between: nothing seen."""
+    solid, dashed = "M{:.1f} {:.1f}h0".format(*pixels[0]), ""
+    for k in range(1, len(pixels)):
+        before, here = ("{:.1f} {:.1f}".format(*pixels[end]) for end in (k - 1, k))
+        if heights_m[k] - heights_m[k - 1] < 1.5 * STEP_M:
+            solid += f"L{here}"
+        else:
+            solid += f"M{here}h0"
+            dashed += f"M{before}L{here}"
+    return solid, dashed
+
+
 def _breast_height(x_px: float, height_m: float, ends_m: str, tree_id: int | None) -> str:
     """The line at breast height; with a grip where it may be dragged."""
-    line = f'<path d="M{x_px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{_HERE}" stroke-dasharray="4 3"/>'
+    below_words = _TOP + 6
+    line = f'<path d="M{x_px:.1f} {below_words}V{_HEIGHT - _BOTTOM}" stroke="{_HERE}" stroke-dasharray="4 3"/>'
     if tree_id is None:
         return line
     # At an end its words would lie on those of the axis, or beyond the picture.

@@ -14,6 +14,7 @@ from dbh_studio.core.section_drawing import CURVE_TITLES
 from dbh_studio.ui.bridge import call, esc
 from dbh_studio.ui.html import facts, plain
 
+_AS_GOOD_AS_THERE_M = 0.05  # a leaning stem is measured a little lower than its breast height along the stem
 DEFINITION_TITLES = {"curve": "perimeter / π", "tape": "tape: convex girth / π", "area": "equal-area circle"}
 
 
@@ -48,6 +49,7 @@ def tree_card(
     scale: str = "",
     said: str = "",
     actions: str = "",
+    plot_height_m: float | None = None,
 ) -> str:
     """What the forester reads after clicking a trunk.
 
@@ -58,6 +60,7 @@ def tree_card(
         scale: What of the scale's error is in the interval, see `scale_words`.
         said: HTML under the number: what is to be decided, what a person said of it.
         actions: HTML of buttons that do what the remedy of a refusal says.
+        plot_height_m: Breast height of the plot: a diameter of another height says so.
     """
     title = _card_title(tree_id)
     if isinstance(result, Refusal):
@@ -77,17 +80,19 @@ def tree_card(
         f'<div class="dbh dbh-card" data-tree="{tree_id}" data-dbh="{result.dbh_cm:.1f}"><div class="dbh-number">'
         f'{title}<b>{result.dbh_cm:.1f}</b><small title="{tip}">cm{interval}</small>'
         f'<span class="dbh-badge" data-quality="{esc(result.quality)}">{esc(result.quality)}</span></div>'
-        f"{said}{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}{facts(_card_facts(result))}"
+        f"{said}{section}{f'<ul class=dbh-list>{flags}</ul>' if flags else ''}"
+        f"{facts(_card_facts(result, plot_height_m))}"
         f"<details><summary>How it was measured</summary>{facts(_measuring_facts(result, scale))}</details></div>"
     )
 
 
-def _card_facts(result: DbhEstimate) -> list[tuple[str, str]]:
+def _card_facts(result: DbhEstimate, plot_height_m: float | None) -> list[tuple[str, str]]:
     """What one compares with the tree in the forest."""
     cut, girth = result.section, result.diameters["tape"]
     round_cm = [np.pi * value for value in (girth.value_cm, girth.low_cm, girth.high_cm) if value is not None]
+    is_elsewhere = plot_height_m is not None and abs(cut.hom_m - plot_height_m) > _AS_GOOD_AS_THERE_M
     pairs = [
-        ("Measured at", f"{cut.hom_m:.2f} m"),
+        ("Measured at", f"{cut.hom_m:.2f} m" + (f", not {plot_height_m:.2f} m as the plot" if is_elsewhere else "")),
         ("Tape round it", _in_brackets(round_cm) + " cm"),
         ("Ring seen", f"{cut.coverage_deg:.0f}°, largest gap {cut.max_gap_deg:.0f}°"),
     ]

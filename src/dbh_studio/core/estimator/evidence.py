@@ -37,6 +37,9 @@ _FEW_POINTS = 100
 _LEAN_DEG = 10.0
 _SHORT_STRETCH_M = 0.4
 _OFF_M = 0.05
+_HERE_M = 0.15
+_HERE_SECTORS, _HERE_EXPECTED, _HERE_LEFT = 12, 5.0, 0.1  # points in a sector; what is left of them
+_UNSEEN_HERE_DEG = 90.0
 _TOUCHING_M = 0.05
 # Made stems have a contrast of 0.6 and more and are filled up to 0.45; heaps without any ring have 0.4 and 1.1 in the
 # median.
@@ -55,6 +58,7 @@ class Evidence:
         seen: (72,) 1 where the outline is supported.
         stretch_m: Length of stem that was seen.
         off_m: How far breast height is from it; 0 inside.
+        unseen_here_deg: How much of the ring seen was seen above and below, and not at breast height itself.
         wall_ratio: How many times thicker the layer of points is on its thick sides than on its thin ones.
         bulge_m: How far the stem at breast height stands out of the taper of the rest; negative for a waist.
         bulge_sd_m: Standard deviation of that.
@@ -69,6 +73,7 @@ class Evidence:
     seen: Float64
     stretch_m: float
     off_m: float
+    unseen_here_deg: float
     wall_ratio: float
     bulge_m: float
     bulge_sd_m: float
@@ -108,6 +113,7 @@ def evidence_of(points: Float64, tube: Tube) -> Evidence | None:
         np.repeat(seen, N_OUTLINE // len(seen)),
         high - low,
         max(low, -high, 0.0),
+        _unseen_here_deg(at, seen, high - low),
         _wall_ratio(near.at, near.error, tube),
         bulge,
         bulge_sd,
@@ -155,9 +161,13 @@ def flags_of(
     if oval_of(tube) > ODD_SHAPE:
         flags.append(Flag("not_round", "far from round: two stems in one section, or a very irregular one"))
     if evidence.off_m > _OFF_M:
-        flags.append(
-            Flag("not_at_height", f"the stem was seen only {100 * evidence.off_m:.0f} cm away from breast height")
+        words = f"the stem was seen only {100 * evidence.off_m:.0f} cm away from breast height"
+        flags.append(Flag("not_at_height", words))
+    elif evidence.unseen_here_deg >= _UNSEEN_HERE_DEG:
+        words = (
+            f"no points on {evidence.unseen_here_deg:.0f}° of the ring at breast height itself, only above and below"
         )
+        flags.append(Flag("not_at_height", words))
     flags += _beside(beside)
     if evidence.n_points < _FEW_POINTS:
         flags.append(Flag("few_points", f"few points: {evidence.n_points}"))
@@ -211,6 +221,16 @@ def _seen(angle: Float64, error: Float64, sigma: float) -> Float64:
     (best,) = quantiles(held, (_BEST_BINS,))
     least = np.maximum(_BIN_DEVIATIONS * np.sqrt(around + 1.0), np.minimum(_BIN_SHARE * best, _BIN_PLENTY))
     return (held - clutter >= least).astype(np.float64)
+
+
+def _unseen_here_deg(at: Polar, seen: Float64, stretch_m: float) -> float:
+    """Sectors of the ring seen that are empty near breast height, where five points and more were if spread evenly."""
+    sector = np.floor((at.angle() + 2 * np.pi) * (_HERE_SECTORS / (2 * np.pi))).astype(np.int64) % _HERE_SECTORS
+    here = np.bincount(sector[np.abs(at.along) <= _HERE_M], minlength=_HERE_SECTORS)
+    expected = np.bincount(sector, minlength=_HERE_SECTORS) * min(2.0 * _HERE_M / max(stretch_m, 1e-9), 1.0)
+    is_seen = np.repeat(seen, N_OUTLINE // len(seen)).reshape(_HERE_SECTORS, -1).mean(axis=1) >= 0.5
+    is_empty = is_seen & (expected >= _HERE_EXPECTED) & (here <= _HERE_LEFT * expected)
+    return float(np.count_nonzero(is_empty) * 360.0 / _HERE_SECTORS)
 
 
 def _arc_and_gap_deg(seen: Float64) -> tuple[float, float]:
