@@ -358,6 +358,8 @@ def main() -> None:
         return
     if len(options.n) != len(options.first):
         parser.error("as many numbers are needed after --first as after -n")
+    if options.jobs < 1:
+        parser.error("--jobs must be 1 or more")
     start = 15_000 if options.development else 10_000
     seeds = [start + first + k for first, n in zip(options.first, options.n, strict=True) for k in range(n)]
     found = run(options.methods, seeds, options.scenarios, jobs=options.jobs)

@@ -151,6 +151,15 @@ def test_points_left_out_are_not_measured_and_the_others_keep_their_places():
     assert max(full) < 300
 
 
+def test_a_ring_drawn_in_the_picture_of_the_papers_band_lies_where_it_should():
+    session = plot()
+    correct(session, 2, "curve", "fourier")
+    at = session.measurement(2).result.hom_m
+    assert at == pytest.approx(1.37, abs=0.01)  # the middle of 1.22 to 1.52 m
+    correct(session, 2, "ring", circle(session, 2, z_m=at, diameter_m=0.26))
+    assert session.measurement(2).result.flag_codes == ("drawn",)
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_a_drawn_ring_is_the_diameter_at_its_own_height(tilt):
     session = plot()

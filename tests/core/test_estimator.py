@@ -256,6 +256,9 @@ class TestRobust:
             (flag,) = [flag for flag in result.flags if flag.code == "not_at_height"]
             assert re.search(words, flag.words)
             assert result.chosen.holds(40.0)
+        # Behind undergrowth it was seen above alone, so the words must not say both.
+        (flag,) = measured(points[~((points[:, 2] < 1.5) & (np.abs(off) > 0.8))]).flags
+        assert flag.code == "not_at_height" and "only above or below" in flag.words
         # A hole in the bark's points is no such thing, nor are points so few that chance leaves sectors empty.
         assert "not_at_height" not in codes(measured(points[~((height < 0.3) & (np.abs(off) < 0.5))]))
         assert "not_at_height" not in codes(measured(stem(n=300)))

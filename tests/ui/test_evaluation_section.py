@@ -18,8 +18,9 @@ from panel import LONG, idle
 from dbh_studio.app import commands, pipeline
 from dbh_studio.app.evaluation import EvaluationRequest, evaluate_files, evaluate_plot, report_files
 from dbh_studio.core.comparison import Grouping
+from dbh_studio.errors import FileError
 from dbh_studio.io.evaluation_report import rounded
-from dbh_studio.ui.evaluation_section import lines_table, misfits, summary
+from dbh_studio.ui.evaluation_section import failure, lines_table, misfits, summary
 
 
 @pytest.fixture
@@ -177,6 +178,12 @@ def test_a_table_that_does_not_help_is_told(measured, tmp_path, content, words):
     if content:
         measured.wait_text("odd.csv")  # which table it is about
     measured.wait(lambda t: "Type where a table" not in t.text())
+
+
+def test_why_nothing_could_be_compared_names_the_file_as_text():
+    told = failure(FileError("plots/<b>.csv", "it has no column <i>", "Name it <u>."))
+    assert "&lt;b&gt;.csv: it has no column &lt;i&gt;" in told and "Name it &lt;u&gt;." in told
+    assert "/: it is a folder" in failure(FileError("/", "it is a folder"))
 
 
 def test_a_table_that_helps_takes_the_place_of_what_was_wrong_with_the_last(measured, field, tmp_path):

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from dbh_studio.core.dbh import DbhEstimate, Refusal, measure_stem
+from dbh_studio.core.protocol_measure import measure_by_protocol
 from dbh_studio.core.scale import ScaleEstimate
+from dbh_studio.core.section_drawing import section_drawing
 from dbh_studio.settings import MeasureSettings
 from dbh_studio.ui import html, tree_card
 from dbh_studio.ui.section_svg import section_svg
@@ -267,6 +269,7 @@ def test_what_is_said_to_be_no_ring_is_not_drawn_as_one_that_is_known(half_seen,
     picture = section_svg(refused, curve="shrinkage")
     is_known = code == "small_arc"  # its band says what else would agree with the points
     assert ("data-band" in picture) == ("90 % interval" in picture) == ("data-seen" in picture) == is_known
+    assert ("data-band" in section_drawing(refused, curve="shrinkage")) == is_known  # what the report has
     outline = re.search(r'<polygon data-curve="shrinkage" [^>]+>', picture)
     assert outline is not None and "stroke-dasharray" in outline.group()
 
@@ -275,6 +278,22 @@ def test_a_diameter_of_another_height_than_the_plots_says_so(half_seen):
     at = half_seen.section.hom_m
     assert "as the plot" not in tree_card.tree_card(7, half_seen, plot_height_m=at)
     assert f"{at:.2f} m, not {at + 0.5:.2f} m as the plot" in tree_card.tree_card(7, half_seen, plot_height_m=at + 0.5)
+
+
+@pytest.mark.parametrize("curve", ["shrinkage", "circle", "fourier", "ellipse", "bspline"])
+def test_no_diameter_where_the_plots_rules_have_it_says_it_is_elsewhere(curve):
+    """The paper's band reaches farther up than down, and along a stem that leans breast height lies lower."""
+    c, s = np.cos(np.radians(25.0)), np.sin(np.radians(25.0))
+    leaning = (cylinder() - [0, 0, 1.3]) @ [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    for points, along in ((cylinder(), "vertical"), (leaning + [0, 0, 1.3], "stem")):
+        rules = MeasureSettings(curve=curve, along=along)
+        result = measure_by_protocol(points, settings=rules)
+        assert isinstance(result, DbhEstimate)
+        card = tree_card.tree_card(7, result, plot_height_m=tree_card.height_of_plot_m(result, rules))
+        assert "Measured at" in card and "as the plot" not in card
+        moved = rules.changed(breast_height_m=1.5)
+        card = tree_card.tree_card(7, result, plot_height_m=tree_card.height_of_plot_m(result, moved))
+        assert "as the plot" in card
 
 
 def test_the_band_is_the_interval_on_average(half_seen):

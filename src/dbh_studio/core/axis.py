@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dbh_studio.core.arrays import Float64
+from dbh_studio.core.curves import CURVES
 from dbh_studio.core.robust import Circle, robust_circle, thinned, tukey_sigma, tukey_weight
 from dbh_studio.settings import MeasureSettings
 
@@ -88,6 +89,25 @@ def stem_axis(points_m: Float64, *, settings: MeasureSettings, seed: int) -> Ste
 def band_m(settings: MeasureSettings) -> tuple[float, float]:
     """Lower and upper height of the band above ground."""
     return settings.breast_height_m - settings.band_below_m, settings.breast_height_m + settings.band_above_m
+
+
+def height_by_rules_m(settings: MeasureSettings, *, curve: str, lean_deg: float) -> float:
+    """Where the rules have a stem measured, as `CrossSection.hom_m` is counted: vertically above its base.
+
+    That is not breast height itself of a stem that leans, where heights are along it, nor of the paper's curves, of
+    which the band reaches farther up than down.
+
+    Args:
+        settings: The rules.
+        curve: Which method gives the diameter.
+        lean_deg: Of the stem.
+    """
+    height_m = settings.breast_height_m
+    if settings.along == "stem":
+        height_m *= float(np.cos(np.radians(lean_deg)))
+    if curve in CURVES:
+        height_m += 0.5 * (settings.band_above_m - settings.band_below_m)
+    return height_m
 
 
 def _slice_circles(

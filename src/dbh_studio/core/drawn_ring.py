@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from dbh_studio.core.arrays import Bool, Float64, readonly
-from dbh_studio.core.axis import StemAxis
+from dbh_studio.core.axis import StemAxis, height_by_rules_m
 from dbh_studio.core.curves.base import distance_to_outline, outline_centroid, outline_metrics
 from dbh_studio.core.measured import CurveFit, DbhEstimate, Flag, Refusal
 from dbh_studio.core.polygons import crosses_itself
@@ -170,8 +170,9 @@ def _flags(section: CrossSection, outline: Float64, settings: MeasureSettings, g
     if short > _COARSE:
         words += f"; with {n} corners up to {100 * short:.1f} % too thin"
     flags = [Flag(DRAWN, words)]
-    if abs(section.hom_m - settings.breast_height_m) > _AWAY_M:
-        words = f"the ring lies at {section.hom_m:.2f} m, not at {settings.breast_height_m:.2f} m"
+    planned_m = height_by_rules_m(settings, curve=settings.curve, lean_deg=section.lean_deg)
+    if abs(section.hom_m - planned_m) > _AWAY_M:
+        words = f"the ring lies at {section.hom_m:.2f} m, not at {planned_m:.2f} m"
         flags.append(Flag("not_at_height", words))
     if section.coverage_deg < GOOD.coverage_deg:
         flags.append(Flag("partial_arc", f"points along {section.coverage_deg:.0f}° of the ring drawn"))

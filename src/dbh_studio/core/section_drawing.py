@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from html import escape
 
 import numpy as np
@@ -39,6 +40,8 @@ _CM_PER_INCH = 2.54
 # Of the scale bar.
 _CENTIMETRES, _INCHES = (100, 50, 20, 10, 5, 2, 1), (40, 20, 10, 5, 2, 1, 0.5)
 _MAX_DOTS = 700
+# Refusals that say there is no ring: what was tried must not look like one that is known to a hair.
+_NO_RING = ("no_ring", "clutter")
 
 
 def section_drawing(
@@ -55,7 +58,7 @@ def section_drawing(
     section = result.section
     if section is None or len(section.uv_m) == 0:
         return ""
-    fits = {name: fit for name, fit in result.fits.items() if isinstance(fit, CurveFit)}
+    fits = fits_to_draw(result)
     frame = _Frame.around(section, fits.get(curve))
     parts = [
         f'<svg class="dbh-section" viewBox="0 0 {_SIZE} {_SIZE}" role="img" data-frame="{frame.words()}" '
@@ -73,6 +76,17 @@ def section_drawing(
         "</svg>",
     ]
     return "".join(parts)
+
+
+def fits_to_draw(result: DbhEstimate | Refusal) -> dict[str, CurveFit]:
+    """The curves that were fitted; where no ring stands out, as if nothing was seen of them: dashed, without a band."""
+    fits = {name: fit for name, fit in result.fits.items() if isinstance(fit, CurveFit)}
+    if not isinstance(result, Refusal) or result.code not in _NO_RING:
+        return fits
+    return {
+        name: replace(fit, outline_seen=np.zeros(len(fit.outline_uv_m), bool), outline_sd_m=None)
+        for name, fit in fits.items()
+    }
 
 
 class _Frame:

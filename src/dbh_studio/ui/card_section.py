@@ -91,7 +91,7 @@ class CardSection(Section):
             scale=scale,
             said=said,
             actions=actions,
-            plot_height_m=document.settings.measure.breast_height_m,
+            plot_height_m=tree_card.height_of_plot_m(result, document.settings.measure),
         )
         set_content(self._card, card + flag_html(selected, record.flag))
 

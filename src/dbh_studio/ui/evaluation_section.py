@@ -242,7 +242,7 @@ class EvaluationSection:
 
 def failure(error: StudioError) -> str:
     """HTML: why nothing could be compared; it stands where the answer would, and never asks for what was given."""
-    where = f"{error.path.name}: " if isinstance(error, FileError) else ""
+    where = f"{error.path.name or error.path}: " if isinstance(error, FileError) else ""
     return html.message(f"{where}{error.problem}", level="stop", remedy=error.remedy)
 
 

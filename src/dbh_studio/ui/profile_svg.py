@@ -58,7 +58,7 @@ def profile_svg(profile: Sequence[ProfilePoint], *, height_m: float, tree_id: in
 
 
 def _lines(heights_m: Sequence[float], pixels: Sequence[tuple[float, float]]) -> tuple[str, str]:
-    """SVG paths of what was measured, a dot where that is one height alone, and of what is between: nothing seen."""
+    """SVG paths of what was measured, a dot where that is one height alone, and of what is between: no diameter."""
     solid, dashed = "M{:.1f} {:.1f}h0".format(*pixels[0]), ""
     for k in range(1, len(pixels)):
         before, here = ("{:.1f} {:.1f}".format(*pixels[end]) for end in (k - 1, k))

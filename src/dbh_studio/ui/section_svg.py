@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from html import escape
-
-import numpy as np
 
 from dbh_studio.core.arrays import Float64
 from dbh_studio.core.dbh import CurveFit, DbhEstimate, Refusal
@@ -15,14 +12,12 @@ from dbh_studio.core.section_drawing import (
     CURVE_TITLES,
     LEFT_OUT_COLOUR,
     USED_COLOUR,
+    fits_to_draw,
     section_drawing,
 )
 from dbh_studio.ui.bridge import call
 
 __all__ = ["CURVE_COLOURS", "section_svg"]
-
-# Refusals that say there is no ring: what was tried must not look like one that is known to a hair.
-_NO_RING = ("no_ring", "clutter")
 
 
 def section_svg(result: DbhEstimate | Refusal, *, curve: str, crossed_uv_m: Float64 | None = None) -> str:
@@ -33,18 +28,9 @@ def section_svg(result: DbhEstimate | Refusal, *, curve: str, crossed_uv_m: Floa
         curve: The chosen curve, drawn thick, and whose inliers are coloured.
         crossed_uv_m: (N, 2) points that a person has left out.
     """
-    if isinstance(result, Refusal) and result.code in _NO_RING:
-        result = replace(result, fits={name: _as_tried(fit) for name, fit in result.fits.items()})
     picture = section_drawing(result, curve=curve, crossed_uv_m=crossed_uv_m)
     has_crossed = crossed_uv_m is not None and len(crossed_uv_m) > 0
     return f'<div class="dbh-cut">{picture}{_legend(result, curve, has_crossed)}</div>' if picture else ""
-
-
-def _as_tried(fit: CurveFit | Refusal) -> CurveFit | Refusal:
-    """The curve with no part of it seen, which is drawn dashed, and without an interval."""
-    if not isinstance(fit, CurveFit):
-        return fit
-    return replace(fit, outline_seen=np.zeros(len(fit.outline_uv_m), bool), outline_sd_m=None)
 
 
 def _legend(result: DbhEstimate | Refusal, curve: str, has_crossed: bool) -> str:
@@ -68,8 +54,8 @@ def _legend(result: DbhEstimate | Refusal, curve: str, has_crossed: bool) -> str
     words = [(USED_COLOUR, "points used"), (LEFT_OUT_COLOUR, "left out")]
     if has_crossed:
         words.append((CROSSED_COLOUR, "left out by hand"))
-    fit = result.fits.get(curve)
-    if isinstance(fit, CurveFit) and fit.outline_sd_m is not None:
+    fit = fits_to_draw(result).get(curve)
+    if fit is not None and fit.outline_sd_m is not None:
         words.append((f"{CURVE_COLOURS[curve]}55", "90 % interval"))
     dots = "".join(f'<span><i style="background:{colour}"></i>{text}</span>' for colour, text in words)
     return f'<div class="dbh-legend">{"".join(buttons)}<div class="dbh-dots">{dots}</div></div>'

@@ -7,14 +7,16 @@ from itertools import zip_longest
 
 import numpy as np
 
+from dbh_studio.core.axis import height_by_rules_m
 from dbh_studio.core.dbh import DbhEstimate, Diameter, Refusal
 from dbh_studio.core.drawn_ring import DRAWN
 from dbh_studio.core.scale import ScaleEstimate
 from dbh_studio.core.section_drawing import CURVE_TITLES
+from dbh_studio.settings import MeasureSettings
 from dbh_studio.ui.bridge import call, esc
 from dbh_studio.ui.html import facts, plain
 
-_AS_GOOD_AS_THERE_M = 0.05  # a leaning stem is measured a little lower than its breast height along the stem
+_AS_GOOD_AS_THERE_M = 0.05  # leans found twice differ a little, and with them heights along the stem
 DEFINITION_TITLES = {"curve": "perimeter / π", "tape": "tape: convex girth / π", "area": "equal-area circle"}
 
 
@@ -60,7 +62,7 @@ def tree_card(
         scale: What of the scale's error is in the interval, see `scale_words`.
         said: HTML under the number: what is to be decided, what a person said of it.
         actions: HTML of buttons that do what the remedy of a refusal says.
-        plot_height_m: Breast height of the plot: a diameter of another height says so.
+        plot_height_m: From `height_of_plot_m`: a diameter of another height says so.
     """
     title = _card_title(tree_id)
     if isinstance(result, Refusal):
@@ -84,6 +86,14 @@ def tree_card(
         f"{facts(_card_facts(result, plot_height_m))}"
         f"<details><summary>How it was measured</summary>{facts(_measuring_facts(result, scale))}</details></div>"
     )
+
+
+def height_of_plot_m(result: DbhEstimate | Refusal, rules: MeasureSettings) -> float | None:
+    """Where a plot's rules have this stem measured; None of a stem that has no diameter."""
+    if isinstance(result, Refusal):
+        return None
+    curve = rules.curve if result.curve == DRAWN else result.curve
+    return height_by_rules_m(rules, curve=curve, lean_deg=result.section.lean_deg)
 
 
 def _card_facts(result: DbhEstimate, plot_height_m: float | None) -> list[tuple[str, str]]:

@@ -58,7 +58,7 @@ class Evidence:
         seen: (72,) 1 where the outline is supported.
         stretch_m: Length of stem that was seen.
         off_m: How far breast height is from it; 0 inside.
-        unseen_here_deg: How much of the ring seen was seen above and below, and not at breast height itself.
+        unseen_here_deg: How much of the ring seen was seen above or below, and not at breast height itself.
         wall_ratio: How many times thicker the layer of points is on its thick sides than on its thin ones.
         bulge_m: How far the stem at breast height stands out of the taper of the rest; negative for a waist.
         bulge_sd_m: Standard deviation of that.
@@ -164,9 +164,7 @@ def flags_of(
         words = f"the stem was seen only {100 * evidence.off_m:.0f} cm away from breast height"
         flags.append(Flag("not_at_height", words))
     elif evidence.unseen_here_deg >= _UNSEEN_HERE_DEG:
-        words = (
-            f"no points on {evidence.unseen_here_deg:.0f}° of the ring at breast height itself, only above and below"
-        )
+        words = f"no points on {evidence.unseen_here_deg:.0f}° of the ring at breast height itself, only above or below"
         flags.append(Flag("not_at_height", words))
     flags += _beside(beside)
     if evidence.n_points < _FEW_POINTS:
