@@ -91,23 +91,10 @@ def band_m(settings: MeasureSettings) -> tuple[float, float]:
     return settings.breast_height_m - settings.band_below_m, settings.breast_height_m + settings.band_above_m
 
 
-def height_by_rules_m(settings: MeasureSettings, *, curve: str, lean_deg: float) -> float:
-    """Where the rules have a stem measured, as `CrossSection.hom_m` is counted: vertically above its base.
-
-    That is not breast height itself of a stem that leans, where heights are along it, nor of the paper's curves, of
-    which the band reaches farther up than down.
-
-    Args:
-        settings: The rules.
-        curve: Which method gives the diameter.
-        lean_deg: Of the stem.
-    """
-    height_m = settings.breast_height_m
-    if settings.along == "stem":
-        height_m *= float(np.cos(np.radians(lean_deg)))
-    if curve in CURVES:
-        height_m += 0.5 * (settings.band_above_m - settings.band_below_m)
-    return height_m
+def middle_m(settings: MeasureSettings, curve: str) -> float:
+    """The height a diameter belongs to: breast height; of the paper's curves the middle of their band."""
+    low, high = band_m(settings)
+    return 0.5 * (low + high) if curve in CURVES else settings.breast_height_m
 
 
 def _slice_circles(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from dbh_studio.core.arrays import Bool, Float64, readonly
-from dbh_studio.core.axis import StemAxis, height_by_rules_m
+from dbh_studio.core.axis import StemAxis, middle_m
 from dbh_studio.core.curves.base import distance_to_outline, outline_centroid, outline_metrics
 from dbh_studio.core.measured import CurveFit, DbhEstimate, Flag, Refusal
 from dbh_studio.core.polygons import crosses_itself
@@ -53,7 +53,7 @@ def drawn_diameter(
         measured: What was measured of the stem without the ring; its section is kept where the ring lies in its plane,
             its curves to compare with.
         axis: Of the stem, for a stem that has no section.
-        settings: Of the measurement.
+        settings: Of the measurement, with the height of this stem (`along_the_stem`).
         ground_note: Added to the flags.
     """
     section, fits = measured.section, measured.fits
@@ -170,7 +170,7 @@ def _flags(section: CrossSection, outline: Float64, settings: MeasureSettings, g
     if short > _COARSE:
         words += f"; with {n} corners up to {100 * short:.1f} % too thin"
     flags = [Flag(DRAWN, words)]
-    planned_m = height_by_rules_m(settings, curve=settings.curve, lean_deg=section.lean_deg)
+    planned_m = middle_m(settings, settings.curve)
     if abs(section.hom_m - planned_m) > _AWAY_M:
         words = f"the ring lies at {section.hom_m:.2f} m, not at {planned_m:.2f} m"
         flags.append(Flag("not_at_height", words))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import zip_longest
 
 import numpy as np
 
-from dbh_studio.core.axis import height_by_rules_m
+from dbh_studio.core.axis import middle_m
 from dbh_studio.core.dbh import DbhEstimate, Diameter, Refusal
 from dbh_studio.core.drawn_ring import DRAWN
 from dbh_studio.core.scale import ScaleEstimate
@@ -93,7 +94,10 @@ def height_of_plot_m(result: DbhEstimate | Refusal, rules: MeasureSettings) -> f
     if isinstance(result, Refusal):
         return None
     curve = rules.curve if result.curve == DRAWN else result.curve
-    return height_by_rules_m(rules, curve=curve, lean_deg=result.section.lean_deg)
+    height_m = middle_m(rules, curve)
+    if rules.along == "stem":  # that is lower, counted vertically
+        height_m -= rules.breast_height_m * (1.0 - math.cos(math.radians(result.section.lean_deg)))
+    return height_m
 
 
 def _card_facts(result: DbhEstimate, plot_height_m: float | None) -> list[tuple[str, str]]:
