@@ -49,7 +49,7 @@ make_base() {
 
 # What is committed and what is not yet, but nothing that git ignores: as in a fresh clone. Set-up's results stay.
 copy_tree() {
-    local copy=$room/root/srv/studio
+    local copy=$room/system/srv/studio
     mkdir -p "$copy"
     find "$copy" -mindepth 1 -maxdepth 1 ! -name .venv ! -name '.*_cache' -exec rm -rf {} +
     git -C "$tree" ls-files -z --cached --others --exclude-standard |
@@ -57,17 +57,17 @@ copy_tree() {
 }
 
 [ -d "$room/base" ] || make_base
-if [ -n "$fresh" ] || [ ! -d "$room/root" ]; then
-    rm -rf "$room/root"
-    cp -a "$room/base" "$room/root"
-    chroot "$room/root" useradd --create-home --uid 1000 forester
+if [ -n "$fresh" ] || [ ! -d "$room/system" ]; then
+    rm -rf "$room/system"
+    cp -a "$room/base" "$room/system"
+    chroot "$room/system" useradd --create-home --uid 1000 forester
 fi
-cp /etc/resolv.conf "$room/root/etc/resolv.conf"
-cp /etc/ssl/certs/ca-certificates.crt "$room/root/etc/ssl/certs/ca-certificates.crt"
+cp /etc/resolv.conf "$room/system/etc/resolv.conf"
+cp /etc/ssl/certs/ca-certificates.crt "$room/system/etc/ssl/certs/ca-certificates.crt"
 copy_tree
 name=root uid=0 home=/root
 [ -z "$user" ] || { name=forester uid=1000 home=/home/forester; }
-chown -R "$uid:$uid" "$room/root/srv/studio"
+chown -R "$uid:$uid" "$room/system/srv/studio"
 
 mapfile -t network < <(env | grep -iE '^(https?_proxy|no_proxy|SSL_CERT_FILE|PIP_CERT|REQUESTS_CA_BUNDLE|CURL_CA_BUNDLE)=')
 exec unshare --mount --pid --fork ${offline:+--net} bash -euc '
@@ -80,4 +80,4 @@ exec unshare --mount --pid --fork ${offline:+--net} bash -euc '
     shift "$n"
     exec chroot "$root" runuser -u "$name" -- env -i HOME="$home" PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
         LANG=C.UTF-8 CI=true "${settings[@]}" bash -c '\''cd /srv/studio && exec "$@"'\'' clean-room "$@" </dev/null
-' clean-room "$room/root" "$name" "$home" "${#network[@]}" "${network[@]}" "$@"
+' clean-room "$room/system" "$name" "$home" "${#network[@]}" "${network[@]}" "$@"

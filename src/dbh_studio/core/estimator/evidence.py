@@ -164,7 +164,7 @@ def flags_of(
         words = f"the stem was seen only {100 * evidence.off_m:.0f} cm away from breast height"
         flags.append(Flag("not_at_height", words))
     elif evidence.unseen_here_deg >= _UNSEEN_HERE_DEG:
-        words = f"no points on {evidence.unseen_here_deg:.0f}° of the ring at breast height itself, only above or below"
+        words = f"no points on {evidence.unseen_here_deg:.0f}° of the ring at this height, only above or below"
         flags.append(Flag("not_at_height", words))
     flags += _beside(beside)
     if evidence.n_points < _FEW_POINTS:
